@@ -19,8 +19,9 @@ over the draws. "rectified" rows are the same frames after `rectify` by the cali
 
 --drives degrades the frames of FRAMES/val by `cheap_dashcam`, as a validation of the task undistort does, and estimates
 the flow of each frame alone, by straight edges: the mean of the flows of 256 lenses that the effect draws, weighted by
-their likelihood. "constant" is their mean without weights. --without leaves out frames whose own lens shows, by the
-beginnings of their names.
+their likelihood. "constant" is their mean without weights. For "both" they are weighted also by a normal distribution
+around the flow of the network, of 20 px. --without leaves out frames whose own lens shows, by the beginnings of their
+names.
 
 --clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
 frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
@@ -66,10 +67,12 @@ from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.data.video import convert_video, read_video, write_video
 from torchrefract.effects.base import Effect
+from torchrefract.effects.lens import LensDistortion
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.presets import cheap_dashcam
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
+from torchrefract.warping.flow import resize_flow
 from torchrefract.warping.warp import warp
 
 SETS = {  # name: pictures, and the folder with reference.json, its entry and the calibration there
@@ -86,6 +89,7 @@ _POOLS = {1: 7, 5: 5, 20: 3}  # number of draws by the number of frames
 _WIDTH = 1920  # px, of errors
 _GRID = 41
 _NUM_LENSES, _FLOW_STRIDE = 256, 8  # of the prior of single frames; px
+_NETWORK_PX = 20  # px at 1920, standard deviation of the flow of a network: 1.25 times its mean error of 16 px
 _PRIOR_SEED = 123  # another one than that of the frames
 
 
@@ -268,25 +272,41 @@ def draw_prior(effect: Effect, size: tuple[int, int], *, count: int) -> EffectPr
     )
 
 
-def posterior_flow(gray: np.ndarray, prior: EffectPrior) -> Tensor:
-    """Return the mean flow (2, h, w) of the lenses of a prior, weighted by their likelihood in a picture (H, W)."""
+def costs_of_lenses(gray: np.ndarray, prior: EffectPrior) -> Tensor:
+    """Return the negative log-likelihood (L,) of the lenses of a prior in a picture (H, W)."""
     chains = pool_chains([find_chains(gray)], (gray.shape[0], gray.shape[1]))
-    costs = torch.cat([line_costs(chains, lenses) for lenses in prior.lenses.split(16)]).sum(dim=1)
+    return torch.cat([line_costs(chains, lenses) for lenses in prior.lenses.split(16)]).sum(dim=1)
+
+
+def posterior_flow(costs: Tensor, prior: EffectPrior) -> Tensor:
+    """Return the mean flow (2, h, w) of the lenses of a prior, weighted by their costs (L,)."""
     return torch.einsum("l,lchw->chw", torch.softmax(-costs, dim=0), prior.flows)
 
 
-def held_out(root: Path, size: tuple[int, int], without: Sequence[str]) -> list[dict[str, Any]]:
+def held_out(
+    root: Path,
+    size: tuple[int, int],
+    without: Sequence[str] = (),
+    *,
+    effect: Effect | None = None,
+    network: Network | None = None,
+) -> list[dict[str, Any]]:
     """Estimate the flow of each frame of held-out drives alone; return and print errors, px of a frame 1920 px wide."""
-    frames, effect, rows = FrameFolder(root, size=size, split="val"), cheap_dashcam(), list[dict[str, Any]]()
+    frames, effect, rows = FrameFolder(root, size=size, split="val"), effect or cheap_dashcam(), list[dict[str, Any]]()
     prior = draw_prior(effect, size, count=_NUM_LENSES)
     for i, path in enumerate(frames.paths):
         if not path.name.startswith(tuple(without)):
             pair = effect.degrade(frames[i].image[None], seed=0, keys=[frames.keys[i]])  # the draws of a validation
             true, mean = sparse(pair.restore_flow)[0], prior.flows.mean(dim=0)
-            flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(to_gray(pair.image[0]), prior)}
-            error = {name: _WIDTH / size[1] * (flow - true).norm(dim=0).mean().item() for name, flow in flows.items()}
+            costs, scale = costs_of_lenses(to_gray(pair.image[0]), prior), _WIDTH / size[1]
+            flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(costs, prior)}
+            if network:
+                flows["network"] = sparse(resize_flow(network.predict(pair.image), size))[0]
+                distance = scale * (prior.flows - flows["network"]).norm(dim=1).mean(dim=(1, 2))
+                flows["both"] = posterior_flow(costs + (distance / _NETWORK_PX).square() / 2, prior)
+            error = {name: scale * (flow - true).norm(dim=0).mean().item() for name, flow in flows.items()}
             rows.append({"frame": path.relative_to(root).as_posix(), **error})
-    means = {name: sum(row[name] for row in rows) / len(rows) for name in ("nothing", "constant", "lines")}
+    means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "frame"}
     print(f"{len(rows)} frames", *(f"{name} {value:.2f}" for name, value in means.items()), sep="  ")
     return rows
 
@@ -342,13 +362,11 @@ def main() -> None:
     parser.add_argument(
         "--size", nargs=2, type=count(1), default=[352, 616], help="height and width of those frames, px"
     )
+    parser.add_argument("--wide", action="store_true", help="degrade them by the wide lens of Table 1 instead")
     parser.add_argument("--without", nargs="+", default=[], help="beginnings of the names of frames to leave out")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
     arguments = parser.parse_args()
-    if arguments.drives:
-        rows = held_out(arguments.drives, tuple(arguments.size), arguments.without)
-        return write_json(arguments.out.with_name("held_out.json"), rows)
     network = None
     if arguments.checkpoint:
         loaded = load_model(arguments.checkpoint)
@@ -362,6 +380,10 @@ def main() -> None:
             return write_json(arguments.out.with_name("clip.json"), results)
     elif arguments.clip:
         parser.error("--clip needs --checkpoint, such as lens_small")
+    if arguments.drives:
+        effect = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1)) if arguments.wide else cheap_dashcam()
+        rows = held_out(arguments.drives, tuple(arguments.size), arguments.without, effect=effect, network=network)
+        return write_json(arguments.out.with_name("held_out.json"), rows)
     if arguments.data:
         rows = real(arguments.data, arguments.sets, network)
     else:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.video import read_video
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.presets import cheap_dashcam
@@ -69,11 +70,12 @@ def test_lines_of_one_frame_choose_among_the_lenses_of_an_effect():
     effect, size = cheap_dashcam(), (216, 384)
     prior = lens_estimation.draw_prior(effect, size, count=64)
     assert prior.lenses.shape == (64, 2)
-    flow = lens_estimation.posterior_flow(np.zeros(size, np.uint8), prior)
+    flow = lens_estimation.posterior_flow(lens_estimation.costs_of_lenses(np.zeros(size, np.uint8), prior), prior)
     torch.testing.assert_close(flow, prior.flows.mean(dim=0))  # a frame without edges tells nothing
     clean = torch.from_numpy(poles(*size)).permute(2, 0, 1)[None] / 255
     degraded = effect.degrade(clean, seed=1, keys=[5])
-    flow = lens_estimation.posterior_flow(lens_estimation.to_gray(degraded.image[0]), prior)
+    costs = lens_estimation.costs_of_lenses(lens_estimation.to_gray(degraded.image[0]), prior)
+    flow = lens_estimation.posterior_flow(costs, prior)
     true = lens_estimation.sparse(degraded.restore_flow)[0]
     assert (flow - true).norm(dim=0).mean() < 0.25 * (prior.flows.mean(dim=0) - true).norm(dim=0).mean()
 
@@ -87,3 +89,16 @@ def test_held_out_frames_leave_out_drives_whose_lens_shows(tmp_path, monkeypatch
     assert [row["frame"] for row in rows] == ["val/b_1.png"]
     assert rows[0]["lines"] < 0.5 * min(rows[0]["constant"], rows[0]["nothing"])
     assert "1 frames" in capsys.readouterr().out
+
+
+def test_a_network_that_is_right_improves_on_the_lines_of_a_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 32)
+    for name in ("train/a_1.png", "val/b_1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.zeros((144, 256, 3), np.uint8))  # no lines
+    frames = FrameFolder(tmp_path, size=(144, 256), split="val")
+    true = cheap_dashcam().degrade(frames[0].image[None], seed=0, keys=[frames.keys[0]]).restore_flow
+    network = lens_estimation.Network(lambda _: true, true)
+    (row,) = lens_estimation.held_out(tmp_path, (144, 256), network=network)
+    assert row["network"] == pytest.approx(0, abs=1e-3)
+    assert row["both"] < 0.7 * row["lines"]

@@ -47,7 +47,11 @@ def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_pa
 # Flows that fold: pixels are shown several times, or next to a fold. The last one folds outside of the frame.
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("Turbulence", 0), ("rough Turbulence", 1), ("DivergenceFree", 1), ("Compose", 13), ("DivergenceFree", 124)],
+    [
+        *[("Turbulence", 0), ("rough Turbulence", 1), ("DivergenceFree", 1), ("DivergenceFree", 124)],
+        # The inverse of one warp stretches the error of another; a pixel lies between two sheets of a fold.
+        *[("Compose", 13), ("Compose", 294), ("Compose", 128)],
+    ],
 )
 def test_restore_flows_next_to_folds_keep_their_tolerance(name, seed):
     trial = attempt(name, seed, (270, 480))

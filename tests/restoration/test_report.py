@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,9 @@ from matplotlib.image import BboxImage
 from torch import Tensor, nn
 
 from torchrefract import Pair, presets
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import road_scenes
+from torchrefract.restoration import report
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import (
     RunSummary,
@@ -26,7 +29,7 @@ from torchrefract.restoration.report import (
     summary,
     verdict,
 )
-from torchrefract.restoration.tasks import Restored, Undistort
+from torchrefract.restoration.tasks import Deweather, Restored, Undistort
 from torchrefract.visualization.color import flow_to_rgb
 
 # CSVLogger writes a row for validation and a row for training in each epoch, most cells empty.
@@ -337,6 +340,22 @@ def test_other_ranks_and_runs_without_validation_write_nothing(tmp_path, capsys,
     callback.teardown(trainer, model, "validate")
     assert capsys.readouterr().out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_warns_of_drives_whose_camera_has_a_lens(tmp_path, capsys, monkeypatch):
+    cv2.imwrite(str(tmp_path / "drive_1.png"), np.zeros((40, 60, 3), np.uint8))
+    frames = FrameFolder(tmp_path, size=(40, 60))
+    monkeypatch.setattr(report, "describe_training", lambda *_: ["frames 1"])
+    monkeypatch.setattr(report, "bent_drives", lambda given: {"fort": 0.0213, "reef": 0.004} if given is frames else {})
+    trainer: Any = SimpleNamespace(is_global_zero=True, datamodule=SimpleNamespace(train=frames))
+    for task in (Undistort(), Deweather()):
+        model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task)
+        RunSummary(str(tmp_path)).on_train_start(trainer, model)
+    first, warning, other = capsys.readouterr().out.splitlines()
+    assert first == other == "frames 1"
+    assert warning.startswith("warning: the camera of fort, reef has a lens")
+    assert "up to 2.1% of the width" in warning
+    assert "torchrefract.estimate_lens" in warning
 
 
 def test_a_resumed_run_copies_complete_metrics_of_the_epochs_before_its_checkpoint(tmp_path):

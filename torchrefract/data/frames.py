@@ -102,7 +102,8 @@ class FrameFolder(Dataset[Frame]):
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames, self.skipped = assign_frames(self.root, size=self.size, split=split, **options)
         self.paths = [self.root / frame.path for frame in frames]
-        self.drives = sorted({frame.drive for frame in frames})
+        self.drive_names = [frame.drive for frame in frames]
+        self.drives = sorted(set(self.drive_names))
         self.keys = [key_of(frame.path) for frame in frames]
         if self.depth is not None:
             self.depth.check((frame.path, None) for frame in frames)

@@ -214,9 +214,11 @@ class Compose(Effect):
             ]
             parts.append(self._parts(looks, places, active, request))
         middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
-        # The share must not depend on the warps that move other samples of the batch.
+        # The share must not depend on the warps that move other samples of the batch. Of several warps it is half as
+        # large, since the inverse of one stretches the errors of the others.
         num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
-        share_px = None if request.tolerance_px is None else request.tolerance_px / num_warps
+        num_shares = num_warps if num_warps == 1 else 2 * num_warps
+        share_px = None if request.tolerance_px is None else request.tolerance_px / num_shares
         progress.move(moving, active, middle, share_px, exposures=parts)
 
     def _parts(

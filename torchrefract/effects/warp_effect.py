@@ -42,9 +42,8 @@ from torchrefract.warping.grid import Points, field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
 
-_MAX_RESIDUAL_PX = (
-    0.5  # of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more
-)
+# Of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more.
+_MAX_RESIDUAL_PX = 0.1
 _SOLVED_PX = 0.005  # residual of a valid inverse of one flow; frames of 8K have positions that are rounded to 0.001 px
 # Measuring the error in each sample pays off if the bounds need a lattice finer than this, in frames of this size.
 _FINE_STRIDE, _MIN_PIXELS = 4, 1 << 16

@@ -18,12 +18,14 @@ from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
 from torchrefract._io import as_path, is_remote, replace_file
+from torchrefract.data.drive_lenses import bent_drives
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.models.lens_net import LensNet
 from torchrefract.restoration.module import RestorationModule
-from torchrefract.restoration.tasks import Restored
+from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.types import Pair
 from torchrefract.visualization.color import flow_to_rgb, full_color_px, hatch_invalid
 from torchrefract.visualization.figures import MapScale, draw_invalid_key, draw_legend
@@ -60,6 +62,10 @@ class RunSummary(Callback):
             carry_over(self.resumed_run, self.run_dir, before_epoch=trainer.current_epoch)
         if isinstance(pl_module, RestorationModule):
             print("\n".join(describe_training(trainer, pl_module)), flush=True)
+            frames = trainer.datamodule.train  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
+            if isinstance(pl_module.task, Undistort) and isinstance(frames, FrameFolder):
+                for warning in describe_bent(bent_drives(frames)):
+                    print(warning, flush=True)
 
     def on_validation_batch_end(
         self,
@@ -120,6 +126,17 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
     if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:
         lines["steps"] += f"; warm-up {num}, a tenth, instead of warmup_steps={model.warmup_steps}"
     return [f"{name:<12}{text}" for name, text in lines.items()]
+
+
+def describe_bent(shifts: Mapping[str, float]) -> list[str]:
+    """Warn of drives whose frames are bent themselves, one line or none; arguments as returned by `bent_drives`."""
+    if not shifts:
+        return []
+    return [
+        f"warning: the camera of {', '.join(shifts)} has a lens, which shifts the left and right edge by up to "
+        f"{max(shifts.values()):.1%} of the width. The network will not learn it, and so learns a wrong lens: take it "
+        "out first, by `python -m torchrefract.estimate_lens` and `rectify`"
+    ]
 
 
 def describe_scene(data: PairData, config: Mapping[str, Any] | None) -> str:

@@ -1,0 +1,59 @@
+"""Find drives whose frames show the lens of their own camera, from which a network would learn a wrong lens."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from torch import Tensor
+
+from torchrefract.cameras.calibration import estimate_lens
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.images import UnreadableImageError, read_image
+
+_Item = TypeVar("_Item")
+_MAX_DRIVES, _MAX_FRAMES = 8, 20  # that are looked at
+_MIN_FRAMES = 8  # of a drive; fewer hold too few straight edges
+_SMALLEST_SHIFT = 0.01  # widths
+
+
+def bent_drives(frames: FrameFolder) -> dict[str, float]:
+    """Estimate the lens of up to eight drives, from up to twenty frames of each, and return those that have one.
+
+    A scene adds its lens to that of the camera, but the flow that a network learns undoes the lens of the scene alone.
+
+    Args:
+        frames: of drives with at least eight frames; shorter ones are left out.
+
+    Returns:
+        for each drive whose straight edges are bent, by its name: how far the lens shifts the left and right edge, in
+        widths of the frame.
+    """
+    by_drive: dict[str, list[Path]] = {}
+    for path, drive in zip(frames.paths, frames.drive_names, strict=True):
+        by_drive.setdefault(drive, []).append(path)
+    long = [drive for drive, paths in by_drive.items() if len(paths) >= _MIN_FRAMES]
+    shifts = {drive: _edge_shift(_spread(by_drive[drive], _MAX_FRAMES)) for drive in _spread(long, _MAX_DRIVES)}
+    return {drive: shift for drive, shift in shifts.items() if shift > _SMALLEST_SHIFT}
+
+
+def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
+    """Return at most so many items, evenly spaced."""
+    number = min(count, len(items))
+    return [items[i * len(items) // number] for i in range(number)]
+
+
+def _edge_shift(paths: list[Path]) -> float:
+    """Return how far the lens of a drive shifts the left and right edge, in widths; 0 if none can be distinguished."""
+    images: list[Tensor] = []
+    for path in paths:
+        try:
+            images.append(read_image(path))
+        except UnreadableImageError:  # the training names them
+            continue
+    images = [image for image in images if image.shape == images[0].shape]
+    if not images or not (estimate := estimate_lens(images)).is_distorted:
+        return 0.0
+    focal = estimate.camera.fx / estimate.camera.width
+    k1, k2, *_ = estimate.camera.coefficients
+    edge = 0.5 / focal
+    return abs(k1 * edge**3 + k2 * edge**5) * focal

@@ -114,6 +114,11 @@ def test_the_checkpoints_are_those_of_the_last_and_of_the_best_epoch(trained):
     assert read_checkpoint(trained.folder / "best.ckpt", task="undistort")["epoch"] == min(epe, key=epe.__getitem__)
 
 
+def test_a_start_says_that_it_loads_and_libraries_say_nothing(spawn, small, tmp_path):
+    outcome = spawn("-m", "torchrefract.train", "+task=undistort", *small, "trainer.max_epochs=0", cwd=tmp_path)
+    assert (outcome.code, outcome.err) == (0, "torchrefract: loading …\n")
+
+
 def test_the_checkpoint_of_a_training_is_sufficient_to_restore(call, tmp_path, trained):
     raw, best = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8), trained.folder / "best.ckpt"
     Image.fromarray(raw).save(tmp_path / "raw.png")

@@ -18,6 +18,7 @@ Options:
     camera=FILE             of the pictures, for all scenes; horizon=0.5 of their height, 0 at the top
     base=DIR                output folder of an earlier run of another model, for the errors relative to it (mCE)
     loss=0.1                share of the clean score that is tolerated; weights=FILE for a model of torchvision
+    worst_case=true         state also the worst of worst_case_draws=8 random draws, which takes 8 times as long
     limit=N                 number of pictures; device=cuda, seed=0 of the draws
 
 Examples:

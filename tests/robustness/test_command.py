@@ -172,7 +172,7 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
     ("word", "message"),
     [
         ("model=nothing:here", "model: a function must be package.module:name that can be imported, got nothing:here"),
-        ("model=bright", "model: model must be package.module:name, torchvision:name, opencv:hog or a file"),
+        ("model=bright", "model: model must be package.module:name, torchvision:name, transformers:name, "),
         ("model=lost.onnx", "model: model must be a file that exists, got lost.onnx"),
         ("model=torchvision:no_such_net", "model: model must be one of torchvision.models.list_models()"),
         ("data=empty", "data must be a folder of pictures, got empty, which holds none"),

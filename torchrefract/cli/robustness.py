@@ -37,7 +37,7 @@ from torchrefract.data.label_files import (
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored, evaluate, move_target
-from torchrefract.robustness.predictors import Predict, import_function, load_predictor
+from torchrefract.robustness.predictors import Predict, import_function, load_predictor, model_files
 from torchrefract.robustness.quantities import QUANTITIES
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
 from torchrefract.robustness.scores import (
@@ -91,11 +91,12 @@ def test_robustness(cfg: DictConfig) -> None:
         num_worst = check_count("worst", cfg.worst, low=0)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
-    settings["format"], settings["files"] = _FORMAT, file_digests([cfg.model, cfg.weights])
     levels = _levels(settings["scene"], settings["severity"])
     device = str(find_device(str(cfg.device)))
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=device)
+    # Ultralytics may have downloaded the file just now.
+    settings["format"], settings["files"] = _FORMAT, file_digests([*model_files(str(cfg.model)), cfg.weights])
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))

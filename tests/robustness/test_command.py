@@ -149,6 +149,14 @@ def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_s
     assert "cheap_dashcam: k1 all tested, the strongest -0." in outcome.out
 
 
+def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(call, tmp_path, frames):
+    for path in frames.iterdir():
+        cv2.imwrite(str(path), np.full((72, 128, 3), 90, np.uint8))
+    message = call(*COMMAND, "scene=cheap_dashcam", "severity=5").message
+    assert message.startswith("model must detect something with a score of at least 0.5 in a clean picture, got nothing")
+    assert not list(tmp_path.glob("out/results*"))
+
+
 def test_masks_and_modules_are_taken(call, tmp_path, frames):
     masks = tmp_path / "masks"
     masks.mkdir()

@@ -120,6 +120,11 @@ def test_robustness(cfg: DictConfig) -> None:
             raise UsageError(str(error)) from error
         if not result.clean.any():
             raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
+        if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
+            raise UsageError(
+                "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check "
+                "its weights, or pass labels=..."
+            )
         about = settings | {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
         write_tables(result, out, about, loss=loss)
         examples = [

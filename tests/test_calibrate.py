@@ -57,16 +57,16 @@ def test_rendered_pictures_on_a_full_disk_raise(tmp_path, monkeypatch):
 
 
 def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibration, "render_views", partial(render_views, count=8))
+    monkeypatch.setattr(calibration, "render_views", partial(render_views, count=6))
     outcome = call("calibrate")
     assert outcome.err == ""
-    assert outcome.out.startswith("calibration/camera.yaml: opencv5 from 8 views in 8 pictures, error 0.0")
+    assert outcome.out.startswith("calibration/camera.yaml: opencv5 from 6 views in 6 pictures, error 0.0")
     camera = read_opencv(tmp_path / "calibration" / "camera.yaml")
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(camera, name) == pytest.approx(getattr(CAMERA, name), rel=1e-3)
     assert camera.coefficients == pytest.approx(CAMERA.coefficients, rel=1e-2)
     assert (camera.width, camera.height, camera.model) == (CAMERA.width, CAMERA.height, "opencv")
-    assert "8 views of 8 pictures" in read_report(tmp_path)
+    assert "6 views of 6 pictures" in read_report(tmp_path)
     written = {path.name for path in (tmp_path / "calibration").iterdir()}
     assert written == {
         "camera.yaml",

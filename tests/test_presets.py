@@ -140,6 +140,13 @@ def test_severities_have_the_documented_values():
         assert sum(flare.strength_range) / 2 == pytest.approx(0.2 * severity)
 
 
+def test_severities_of_heat_haze_have_the_documented_cn2():
+    for severity, cn2 in zip(presets.SEVERITIES, (8e-11, 3e-10, 7e-10, 1.5e-9, 2.8e-9), strict=True):
+        (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, Turbulence))
+        low, high = (math.sqrt(value) for value in haze.equivalent_cn2(width=1920, distance=200.0))
+        assert ((low + high) / 2) ** 2 == pytest.approx(cn2, rel=0.06)
+
+
 @pytest.mark.quick
 def test_the_paper_s_weather_has_the_paper_s_numbers():
     uniform, heterogeneous, flare = SCENES["paper_weather"]().effects

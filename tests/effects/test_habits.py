@@ -1,16 +1,18 @@
 """Effects inside other code: torchvision, kornia, nn.Sequential, a Dataset with workers, and torch.func."""
 
 import copy
+import importlib
 import pickle
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from helpers import EFFECTS, SIZE, random_image
+from helpers import EFFECTS, SIZE, maps_of, random_image
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils import _pytree as pytree
+from torch.utils.data import DataLoader
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
@@ -87,12 +89,9 @@ def test_an_effect_works_between_augmentations_of_kornia(effect, name):
     assert torch.equal(result, scale(effect(flipped)))
 
 
-# A script, since spawned workers import the class of a dataset from its file.
+# A module in a folder of the path, since spawned workers import the class of a dataset.
 SPAWNED = """
-import pickle, sys
-from pathlib import Path
-import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 class Frames(Dataset):
     def __init__(self, effects, images):
@@ -104,36 +103,27 @@ class Frames(Dataset):
     def __getitem__(self, i):
         effect, k = self.effects[i // len(self.images)], i % len(self.images)
         return effect.degrade(self.images[k], seed=7, keys=[2**40 + k]), effect(self.images[0])
-
-if __name__ == "__main__":
-    effects, images = pickle.loads(Path(sys.argv[1]).read_bytes())
-    frames = Frames(list(effects.values()), images)
-    samples = list(DataLoader(frames, batch_size=None, num_workers=2, multiprocessing_context="spawn"))
-    keys = [2**40 + k for k in range(len(images))]
-    for n, (name, effect) in enumerate(effects.items()):
-        rows = samples[n * len(images) : (n + 1) * len(images)]
-        together = effect.degrade(images, seed=7, keys=keys)
-        for field in ("image", "flow", "valid", "restore_flow", "restore_valid", "transmission"):
-            expected = getattr(together, field)
-            if expected is not None:
-                actual = torch.stack([getattr(degraded, field) for degraded, _ in rows])
-                if expected.dtype is torch.bool:
-                    assert (actual != expected).sum() <= expected.numel() // 500, (name, field)
-                else:
-                    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-4 if "flow" in field else 1e-5)
-        # Without a seed all draws differ. A rectification draws nothing.
-        drawn = torch.stack([image for _, image in rows]).flatten(1).unique(dim=0)
-        assert len(drawn) == (1 if name == "rectification" else len(rows)), name
-    print("same")
 """
 
 
-def test_spawned_workers_give_the_samples_of_this_process(spawn, tmp_path: Path):
-    effects = {name: make() for name, make in EFFECTS.items()}
-    (tmp_path / "frames.pkl").write_bytes(pickle.dumps((effects, random_frames(3, 3))))
-    (tmp_path / "load.py").write_text(SPAWNED)
-    done = spawn("load.py", "frames.pkl", cwd=tmp_path)
-    assert (done.code, done.out) == (0, "same\n"), done.err
+def test_spawned_workers_give_the_samples_of_this_process(tmp_path: Path, monkeypatch):
+    effects, images = {name: make() for name, make in EFFECTS.items()}, random_frames(3, 3)
+    (tmp_path / "spawned_frames.py").write_text(SPAWNED)
+    monkeypatch.syspath_prepend(tmp_path)
+    frames = importlib.import_module("spawned_frames").Frames(list(effects.values()), images)
+    samples = list(DataLoader(frames, batch_size=None, num_workers=2, multiprocessing_context="spawn"))
+    for n, (name, effect) in enumerate(effects.items()):
+        rows = samples[n * len(images) : (n + 1) * len(images)]
+        together = effect.degrade(images, seed=7, keys=[2**40 + k for k in range(len(images))])
+        for field, expected in maps_of(together).items():
+            actual = torch.stack([getattr(degraded, field) for degraded, _ in rows])
+            if expected.dtype is torch.bool:
+                assert (actual != expected).sum() <= expected.numel() // 500, (name, field)
+            else:
+                assert_close(actual, expected, rtol=1e-5, atol=1e-4 if "flow" in field else 1e-5)
+        # Without a seed all draws differ. A rectification draws nothing.
+        drawn = torch.stack([image for _, image in rows]).flatten(1).unique(dim=0)
+        assert len(drawn) == (1 if name == "rectification" else len(rows)), name
 
 
 def test_vmap_over_samples_or_params_equals_the_batch(effect):

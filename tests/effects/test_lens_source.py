@@ -80,7 +80,7 @@ def test_cameras_of_drawn_params_are_the_resized_camera():
 
 
 def test_jitter_is_uniform_in_each_number():
-    values, expected = draw_lenses(LensDistortion.from_camera(CAR, jitter=0.1), 2000), lens_of(CAR)
+    values, expected = draw_lenses(LensDistortion.from_camera(CAR, jitter=0.1, frame="pad"), 2000), lens_of(CAR)
     aspect = values[:, 13] / values[:, 12]
     for i, center in enumerate(expected):
         column = aspect if i == 13 else values[:, i]
@@ -126,7 +126,7 @@ def test_drawn_polynomials_move_rays_as_the_covariance_of_a_fisheye_does():
 
 
 def test_all_lenses_of_a_table_are_drawn_equally_often():
-    values = draw_lenses(LensDistortion.from_lenses(OTHERS), 3000)
+    values = draw_lenses(LensDistortion.from_lenses(OTHERS, frame="pad"), 3000)
     expected = torch.tensor([lens_of(camera) for camera in OTHERS], dtype=torch.float64)
     which = (values[:, None] - expected).abs().amax(dim=2)
     assert (which.amin(dim=1) < 1e-15).all()
@@ -135,7 +135,7 @@ def test_all_lenses_of_a_table_are_drawn_equally_often():
 
 
 def test_float32_and_float64_draw_the_same_lens_of_a_table():
-    effect = LensDistortion.from_lenses([replace(CAR, fx=500.0 + i) for i in range(23)])
+    effect = LensDistortion.from_lenses([replace(CAR, fx=500.0 + i) for i in range(23)], frame="pad")
     single = effect.sample(torch.zeros(500, 1, 1, 1), seed=3).focal[:, 0]
     assert_close(single.double(), draw_lenses(effect, 500, seed=3)[:, 12], rtol=1e-6, atol=0)
 
@@ -200,7 +200,7 @@ def test_the_plan_of_a_table_with_a_lens_that_may_fold_is_exact():
 
 
 def test_from_lenses_draws_from_the_table_of_the_package():
-    effect = LensDistortion.from_lenses()
+    effect = LensDistortion.from_lenses(frame="pad")
     near = [lens for lens in read_lenses() if lens.residual_px <= 0.5]
     assert len(near) > 30
     values = draw_lenses(effect, 2000)

@@ -8,7 +8,8 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, Terms
+from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, Terms, distort_polynomial
+from torchrefract.fields import lens_error
 from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow, newton_lens_flow
 from torchrefract.warping.grid import Points, inside
 from torchrefract.warping.lattice import Lattice, pixel_lattice
@@ -267,3 +268,14 @@ def test_newton_steps_at_nodes_of_strong_lenses_round_little(terms, steps, oracl
     assert exact.dtype == torch.float64
     flow = newton_lens_flow(*lens, lattice.points(dtype=torch.float32, device=cpu), num_steps=steps, terms=terms)
     oracle("lens flow at nodes of strong lenses", flow, exact, 1e-3)
+
+
+def test_newton_steps_that_measure_the_errors_end_in_the_inverse_at_every_point(oracle):
+    barrel = torch.tensor([BARREL.get(name, 0.0) for name in POLYNOMIAL12], dtype=torch.float64).view(1, 12, 1)
+    coefficients = torch.cat([barrel, 0 * barrel, -1.2 * barrel])  # each needs another number of steps
+    side = torch.linspace(-0.9, 0.9, 9, dtype=torch.float64)
+    x, y = (axis.flatten().expand(3, -1) for axis in torch.meshgrid(side, side, indexing="ij"))
+    iterates = lens_error._solve(x, y, coefficients)
+    assert iterates is not None
+    back = distort_polynomial(*iterates[-1], coefficients)
+    oracle("measured inverse", torch.stack(back), torch.stack([x, y]), 1e-12, unit="focal lengths")

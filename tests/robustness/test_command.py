@@ -1,3 +1,6 @@
+import base64
+import csv
+import io
 import json
 import re
 from pathlib import Path
@@ -6,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torchvision import models
 
 from torchrefract import presets
@@ -29,6 +33,12 @@ def detect(images):
 
 def count(prediction, target):
     return float(len(prediction["boxes"]) == len(target["boxes"]))
+
+def brightness(images):
+    return images.mean(dim=(1, 2, 3))[:, None]
+
+def darkness(prediction, target):
+    return 1 - prediction.item()
 
 def nobody(prediction, target):
     return None
@@ -88,6 +98,79 @@ def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, t
     (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
     assert call(*words).code == 0
     assert contents(tmp_path / "out") == complete
+
+
+def test_worst_cases_stand_in_the_tables_and_the_report_and_continue_with_equal_bytes(call, tmp_path, frames):
+    words = (COMMAND[0], "model=bright:brightness", *COMMAND[2:], "labels=coco.json", "score=bright:darkness")
+    words += ("scene=[cape_town_fog,cheap_dashcam]", "severity=[1,3]")
+    search = ("worst_case=true", "worst_case_draws=3")
+    outcome = call(*words, *search)
+    assert outcome.code == 0, outcome.err
+    complete = contents(tmp_path / "out")
+    results = json.loads(complete["results.json"])
+    table = list(csv.DictReader(complete["results.csv"].decode().splitlines()))
+    scores = [json.loads(line) for line in complete["scores.jsonl"].splitlines()[1:]]
+    for i, (row, cells) in enumerate(zip(results["levels"], table, strict=True)):
+        worst = [of["levels"][i][2][3] for of in scores]
+        assert all(low <= of["levels"][i][2][0] for low, of in zip(worst, scores, strict=True))
+        assert row["worst_case"] == float(cells["worst_case"]) == pytest.approx(np.mean(worst))
+        assert row["worst_case_low"] <= row["worst_case"] <= row["worst_case_high"]
+    fog, lens = results["levels"][:2], results["levels"][2:]
+    assert all(row["worst_case"] < row["score"] for row in fog)
+    by_scene = results["worst_case"]
+    assert list(by_scene) == ["cape_town_fog", "cheap_dashcam", "all scenes"]
+    for rows, of in zip((fog, lens, fog + lens), by_scene.values(), strict=True):
+        assert of["mean_performance"] == pytest.approx(np.mean([row["score"] for row in rows]))
+        assert of["worst_case"] == pytest.approx(np.mean([row["worst_case"] for row in rows]))
+    assert results["about"]["worst_case_draws"] == 3
+    page = complete["report.html"].decode()
+    for row in results["levels"]:
+        cells = [row["scene"], str(row["severity"]), f"{row['score']:.3f}"]
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+        assert f"<td>{row['worst_case']:.3f}</td>" in page
+    means = by_scene["cape_town_fog"]
+    line = f"<td>cape_town_fog</td><td>{means['mean_performance']:.3f}</td><td>{means['worst_case']:.3f}</td>"
+    assert line in page
+    text = f"mean score {means['mean_performance']:.3f}, of the worst of 3 draws {means['worst_case']:.3f}"
+    assert f"cape_town_fog: {text}\n" in outcome.out
+    # Each picture is that of its worst draw, since the score of an image is 1 less its mean.
+    pictures = re.findall(r"base64,([^\"]+)\"><figcaption>([^<]+)<", page)
+    for data, caption in pictures:
+        ((name, scene, worst),) = re.findall(r"^(.+), (\w+) 3: .+ clean, (.+) in the worst case$", caption)
+        (of,) = [of["levels"] for of in scores if of["name"] == name]
+        lowest = next(values[3] for *level, values in of if level == [scene, 3])
+        assert worst == f"{lowest:.2f}"
+        mean = np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))).mean() / 255
+        assert abs(1 - mean - lowest) < 0.002
+    assert pictures
+    # A run that was killed continues, with the same search alone.
+    lines = complete["scores.jsonl"].splitlines(keepends=True)
+    for path in (tmp_path / "out").iterdir():
+        path.unlink()
+    (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
+    for other in ((), ("worst_case=true",)):
+        message = call(*words, *other).err.splitlines()[-1]
+        assert message.endswith("of the same settings, got one with worst_case_draws=3; choose another")
+    assert call(*words, *search).code == 0
+    assert contents(tmp_path / "out") == complete
+
+
+def test_a_run_without_worst_cases_has_none_and_continues_one_of_an_earlier_version(call, tmp_path, frames):
+    words = (*COMMAND, "scene=cheap_dashcam", "severity=1")
+    assert call(*words).code == 0
+    complete = contents(tmp_path / "out")
+    assert all(b"worst_case_low" not in complete[name] for name in ("results.csv", "results.json"))
+    assert b"worst case" not in complete["report.html"]
+    path = tmp_path / "out" / "scores.jsonl"
+    settings, *lines = [json.loads(line) for line in path.read_text().splitlines()]
+    del settings["worst_case_draws"]  # 0.2.0 had none, and three numbers for each score
+    rows = [
+        of | {"clean": of["clean"][:3], "levels": [[*level, score[:3]] for *level, score in of["levels"]]}
+        for of in lines
+    ]
+    path.write_text("".join(json.dumps(row) + "\n" for row in [settings, *rows]))
+    assert call(*words).code == 0
+    assert (tmp_path / "out" / "results.csv").read_bytes() == complete["results.csv"]
 
 
 def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_files_are_read(call, tmp_path, frames):
@@ -153,7 +236,9 @@ def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(call, t
     for path in frames.iterdir():
         cv2.imwrite(str(path), np.full((72, 128, 3), 90, np.uint8))
     message = call(*COMMAND, "scene=cheap_dashcam", "severity=5").message
-    assert message.startswith("model must detect something with a score of at least 0.5 in a clean picture, got nothing")
+    assert message.startswith(
+        "model must detect something with a score of at least 0.5 in a clean picture, got nothing"
+    )
     assert not list(tmp_path.glob("out/results*"))
 
 
@@ -206,6 +291,8 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
         ("model=bright:one", "predict must return a sequence of one prediction for one image, got dict"),
         ("model=bright:none", "predict must return a sequence of one prediction for one image, got NoneType"),
         ("loss=2", "loss: loss must"),
+        ("worst_case=7", "worst_case: worst_case must be True or False, got 7"),
+        ("worst_case_draws=1", "worst_case_draws: worst_case_draws must be at least 2, got 1"),
         ("weights=damaged.pt", "model: weights must be a state_dict of resnet18, got damaged.pt ("),
         ("weights=other.pt", "model: weights must be a state_dict of resnet18, got other.pt (Error(s) in loading"),
         ("score=bright:nothing", "score: a function must be package.module:name"),

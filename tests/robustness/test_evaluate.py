@@ -93,6 +93,73 @@ def test_differences_between_levels_are_less_than_half_as_uncertain_as_with_inde
         np.testing.assert_allclose(again.scores[level][::-1], values, atol=1e-6)
 
 
+def test_the_worst_case_of_an_image_is_its_lowest_score_of_keyed_draws_the_usual_one_among_them():
+    # At 50 m a black image has the light 1 - 0.05^(50 / V), so the lowest visibility V has the lowest score.
+    calls, effects, samples = [], {s: fogs()[s] for s in (3, 5)}, black(6)
+
+    def predict(images: Tensor) -> Tensor:
+        calls.append(1)
+        return images
+
+    def run(samples: list[tuple[str, Tensor, int]], draws: int | None) -> Robustness:
+        options: dict[str, Any] = {"worst_case_draws": draws, "seed": 3, "depth": flat_depth}
+        return evaluate(predict, samples, {"fog": effects}, lambda image, _: 1 - image.mean().item(), **options)
+
+    usual, result = run(samples, None), run(samples, 5)
+    assert len(calls) == 6 * (1 + 2) + 6 * (1 + 2 * 5)
+    again, more = run(samples[::-1], 5), run(samples, 40)
+    for level, effect in zip(usual.scores, effects.values(), strict=True):
+        draws = [
+            effect.sample(torch.zeros(6, 3, 8, 12), seed=3 + i, keys=[key_of(n) for n in usual.names]) for i in range(5)
+        ]
+        visibility, draw = torch.stack([params.visibility for params in draws]).min(dim=0)
+        np.testing.assert_allclose(result.worst_case[level], 0.05 ** (50 / visibility.double()), atol=1e-5)
+        assert (result.worst_seeds[level] == 3 + draw.numpy()).all()
+        np.testing.assert_array_equal(result.scores[level], usual.scores[level])
+        np.testing.assert_array_equal(again.worst_case[level][::-1], result.worst_case[level])
+        assert (result.worst_case[level] <= result.scores[level]).all()
+        assert (more.worst_case[level] <= result.worst_case[level]).all()
+        low, high = RANGES[level.severity]
+        assert more.worst_case[level].max() < 0.05 ** (50 / (low + 0.3 * (high - low)))  # 1e-6 is the chance of another
+    assert usual.worst_case == usual.worst_seeds == {}
+    worst = {level.severity: values.mean() for level, values in result.worst_case.items()}
+    assert [row.worst_case.value for row in result.rows() if row.worst_case] == pytest.approx([worst[3], worst[5]])
+    assert [row.worst_case for row in usual.rows()] == [None, None]
+    assert result.mean_performance("fog", of="worst_case") == pytest.approx((worst[3] + worst[5]) / 2)
+    assert result.relative_performance(of="worst_case") == pytest.approx((worst[3] + worst[5]) / 2)  # clean 1
+
+
+def test_scores_of_a_run_without_worst_cases_are_not_continued_with_them():
+    stored: dict[str, Any] = {}
+
+    def run(**options: Any) -> Robustness:
+        return evaluate(lambda x: x, black(2), {"fog": fogs()}, lambda *_: 0.5, depth=flat_depth, **options)
+
+    run(on_scored=stored.__setitem__)
+    with pytest.raises(ValueError, match=r"done must have worst cases, got none for drive/000\.png; score it again"):
+        run(done=stored, worst_case_draws=2)
+    for draws, error in ((1, ValueError), (True, TypeError)):
+        with pytest.raises(error, match="worst_case_draws must be"):
+            run(worst_case_draws=draws)
+
+
+@pytest.mark.quick
+def test_the_relative_performance_of_all_scenes_is_the_mean_resilience_rate():
+    scores = {Level("fog", 1): 0.6, Level("fog", 5): 0.2, Level("lens", 3): 0.7}
+    result = Robustness(
+        names=["a.png", "b.png"],
+        clean=np.array([1.0, 0.6]),
+        scores={level: np.array([score, score]) for level, score in scores.items()},
+        values={},
+        set_scores={None: {"mAP": 0.5}} | {level: {"mAP": score / 2} for level, score in scores.items()},
+    )
+    resilience = [(0.6 + 0.2) / (2 * 0.8), 0.7 / (1 * 0.8)]  # of a scene: sum of its scores / (levels x clean score)
+    assert result.relative_performance() == pytest.approx(sum(resilience) / 2)
+    assert result.relative_performance("fog") == pytest.approx(resilience[0])
+    of_set = [(0.3 + 0.1) / (2 * 0.5), 0.35 / (1 * 0.5)]
+    assert result.relative_performance(of="mAP") == pytest.approx(sum(of_set) / 2)
+
+
 def test_labels_and_clean_predictions_move_along_the_flow():
     image = torch.zeros(3, 60, 90)
     image[:, 20:32, 60:80] = 1
@@ -111,8 +178,11 @@ def test_labels_and_clean_predictions_move_along_the_flow():
     still = detection_score(predict(lens.degrade(image, seed=0).image[None])[0], target)
     assert still == 0  # the lens moves the box by more than half of its size
     for given in (target, None):
-        result = evaluate(predict, [("a.png", image, given)], {"lens": {3: lens}}, detection_score, as_target=as_labels)
+        samples = [("a.png", image, given)]
+        options: dict[str, Any] = {"as_target": as_labels, "worst_case_draws": 3}
+        result = evaluate(predict, samples, {"lens": {3: lens}}, detection_score, **options)
         assert [row.score.value for row in result.rows()] == [1]
+        assert result.worst_case[Level("lens", 3)].tolist() == [1]  # of three lenses, each with its flow
 
 
 @pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test counts fields

@@ -20,7 +20,7 @@ from torchvision import tv_tensors
 import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
-from torchrefract._validation import UsageError, check_count, check_number, check_positive
+from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import first_names, list_files
@@ -89,6 +89,7 @@ def test_robustness(cfg: DictConfig) -> None:
         loss = check_number("loss", cfg.loss, low=0.001, high=0.999)
     with naming("worst"):
         num_worst = check_count("worst", cfg.worst, low=0)
+    num_draws = _worst_case_draws(cfg)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
     levels = _levels(settings["scene"], settings["severity"])
@@ -96,7 +97,8 @@ def test_robustness(cfg: DictConfig) -> None:
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=device)
     # Ultralytics may have downloaded the file just now.
-    settings["format"], settings["files"] = _FORMAT, file_digests([*model_files(str(cfg.model)), cfg.weights])
+    files = file_digests([*model_files(str(cfg.model)), cfg.weights])
+    settings |= {"worst_case_draws": num_draws, "format": _FORMAT, "files": files}
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width))
@@ -109,7 +111,7 @@ def test_robustness(cfg: DictConfig) -> None:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
         options = {"as_target": as_labels, "quantities": QUANTITIES, "seed": seed, "done": done, "on_scored": store}
-        options["depth"] = folder.depth
+        options |= {"depth": folder.depth, "worst_case_draws": num_draws}
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
@@ -118,13 +120,7 @@ def test_robustness(cfg: DictConfig) -> None:
             raise UsageError(f"model: {error}") from error
         except ValueError as error:
             raise UsageError(str(error)) from error
-        if not result.clean.any():
-            raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
-        if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
-            raise UsageError(
-                "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check "
-                "its weights, or pass labels=..."
-            )
+        _check_clean(result, folder)
         about = settings | {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
         write_tables(result, out, about, loss=loss)
         examples = [
@@ -133,12 +129,30 @@ def test_robustness(cfg: DictConfig) -> None:
         write_report(result, examples, out, title=f"{cfg.model} on {folder.path.name}", loss=loss)
     of_set = "".join(f", {name} {value:.3f}" for name, value in result.set_scores[None].items())
     print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}{of_set}")
-    for scene in result.quantities:
-        print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+    _print_scenes(result, loss, num_draws)
     if result.failures:
         name, reason = next(iter(result.failures.items()))
         names = first_names(list(result.failures))
         print(f"warning: the model failed for {names}, which are left out; for {name}: {reason}", file=sys.stderr)
+
+
+def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
+    for scene in result.quantities:
+        print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+        if num_draws:
+            mean, worst = result.mean_performance(scene), result.mean_performance(scene, of="worst_case")
+            print(f"{scene}: mean score {mean:.3f}, of the worst of {num_draws} draws {worst:.3f}")
+
+
+def _check_clean(result: Robustness, folder: _Folder) -> None:
+    """Raise UsageError if the scores of the clean pictures say nothing about the model."""
+    if not result.clean.any():
+        raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
+    if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
+        raise UsageError(
+            "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check its "
+            "weights, or pass labels=..."
+        )
 
 
 def choose_score(prediction: Any, target: Any) -> float:
@@ -148,6 +162,15 @@ def choose_score(prediction: Any, target: Any) -> float:
         return detection_score(prediction, target)
     is_class = isinstance(prediction, Tensor) and prediction.ndim == 1
     return classification_score(prediction, target) if is_class else segmentation_score(prediction, target)
+
+
+def _worst_case_draws(cfg: DictConfig) -> int | None:
+    """Return the number of draws of the search for worst cases; None without one."""
+    with naming("worst_case"):
+        is_searched = check_flag("worst_case", cfg.worst_case)
+    with naming("worst_case_draws"):
+        num_draws = check_count("worst_case_draws", cfg.worst_case_draws, low=2)
+    return num_draws if is_searched else None
 
 
 def _levels(scenes: Any, severities: Any) -> list[Level]:
@@ -258,9 +281,9 @@ def _stored_scores(
 
 
 def _worst(result: Robustness, count: int) -> list[tuple[str, Level]]:
-    """Return the pictures whose scores fall most at the highest severity of each scene, if they fall."""
+    """Return the pictures whose scores, of the worst case if it is searched, fall most at the highest severities."""
     highest = {level.scene: level for level in sorted(result.scores, key=lambda level: level.severity)}
-    drops = {scene: result.clean - result.scores[level] for scene, level in highest.items()}
+    drops = {scene: result.clean - (result.worst_case or result.scores)[level] for scene, level in highest.items()}
     return [
         (result.names[i], highest[scene])
         for scene in dict.fromkeys(level.scene for level in result.scores)
@@ -278,17 +301,18 @@ def _example(
     scenes: Callable[[int], Mapping[str, Mapping[int, Effect]]],
     seed: int,
 ) -> Example:
-    """Degrade a picture again, and predict it again."""
+    """Degrade a picture again, in its worst case if that is searched, and predict it again."""
+    i = result.names.index(name)
+    degree, score = "degraded", result.scores[level][i]
+    if result.worst_case:
+        degree, score, seed = "in the worst case", result.worst_case[level][i], int(result.worst_seeds[level][i])
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
     degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=folder.depth(name, image))
     target = as_labels(predict(image[None].clone())[0], (image.shape[1], image.shape[2])) if target is None else target
     moved = move_target(target, degraded, effect)
     prediction = predict(degraded.image[None].clone())[0]
-    i = result.names.index(name)
-    caption = (
-        f"{name}, {level.scene} {level.severity}: {result.clean[i]:.2f} clean, {result.scores[level][i]:.2f} degraded"
-    )
+    caption = f"{name}, {level.scene} {level.severity}: {result.clean[i]:.2f} clean, {score:.2f} {degree}"
     if not isinstance(prediction, dict):
         return Example(degraded.image, caption, None, None)
     boxes = prediction["boxes"][prediction["scores"] >= 0.5]

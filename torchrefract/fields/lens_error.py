@@ -329,12 +329,17 @@ def _solve(x: Tensor, y: Tensor, c: Tensor) -> list[tuple[Tensor, Tensor]] | Non
     """Return the Newton iterates, of which the last has converged; None if none does."""
     limit, terms = _CONVERGED * (1 + torch.hypot(x, y).max()), used_terms(c[..., 0])
     iterates = [newton_undistort(x, y, c, steps=0, terms=terms)]
+    is_moving = torch.ones_like(x, dtype=torch.bool)
     while len(iterates) < _MAX_STEPS:
-        last = iterates[-1]
-        point = newton_step(last, (x, y), *distort_with_jacobian(*last, c, terms))
-        iterates.append(point)
+        # After three steps one point in twenty moves still, those of the strongest lenses far from the center.
+        lenses, points = (is_moving.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
+        part = lenses[:, None], points
+        last = iterates[-1][0][part], iterates[-1][1][part]
+        new = newton_step(last, (x[part], y[part]), *distort_with_jacobian(*last, c[lenses], terms))
         # NaN never counts as converged.
-        if torch.stack([point[0] - last[0], point[1] - last[1]]).abs().max() <= limit:
+        is_moving[part] = ~(torch.maximum((new[0] - last[0]).abs(), (new[1] - last[1]).abs()) <= limit)
+        iterates.append((iterates[-1][0].index_put(part, new[0]), iterates[-1][1].index_put(part, new[1])))
+        if not is_moving.any():
             return iterates
     return None
 

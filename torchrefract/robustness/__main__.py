@@ -18,6 +18,7 @@ Options:
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
     depth=DIR               depth maps of the pictures, as estimate_depth writes
     loss=0.1                share of the clean score that is tolerated; weights=FILE for a model of torchvision
+    worst_case=true         state also the worst of worst_case_draws=8 random draws, which takes 8 times as long
     limit=N                 number of pictures; device=cuda, seed=0 of the draws
 
 Examples:

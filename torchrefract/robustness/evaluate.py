@@ -1,7 +1,8 @@
 """The score of a model on degraded images, by scene and severity, and the physical value that it tolerates."""
 
+import itertools
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import sharing_results
-from torchrefract._validation import check_number
+from torchrefract._validation import check_count, check_number
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
 from torchrefract.robustness.set_scores import Summary, set_scores, summarize
@@ -46,11 +47,15 @@ class ImageScore(NamedTuple):
 
     value: of the quantity of the scene, 0 without one.
     summary: of the prediction and its target, see `set_scores.summarize`.
+    worst_case: the lowest score of several draws; None without a search.
+    worst_seed: the seed of that draw.
     """
 
     score: float
     value: float
     summary: Summary | None
+    worst_case: float | None = None
+    worst_seed: int | None = None
 
 
 class Scored(NamedTuple):
@@ -71,6 +76,7 @@ class Row:
     score: mean over the images.
     drop: mean of the score of each clean image less that of the degraded one.
     set_scores: by name, those of all images together, see `set_scores.set_scores`.
+    worst_case: mean over the images of the lowest score of several draws; None without a search.
     """
 
     scene: str
@@ -82,6 +88,7 @@ class Row:
     score: Estimate
     drop: Estimate
     set_scores: dict[str, float]
+    worst_case: Estimate | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +103,9 @@ class Robustness:
         "mAP50" of detections, "mIoU" of masks.
     quantities: by scene.
     failures: names of the images whose prediction raised, and why.
+    worst_case: for each level, (n,), the lowest score of several draws for each image; empty without a search.
+    worst_seeds: for each level, (n,), the seed of that draw: `effect.degrade(image, seed=..., keys=[key_of(name)])`
+        makes the image again.
     """
 
     names: list[str]
@@ -105,6 +115,8 @@ class Robustness:
     set_scores: dict[Level | None, dict[str, float]]
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
+    worst_case: dict[Level, np.ndarray] = field(default_factory=dict)
+    worst_seeds: dict[Level, np.ndarray] = field(default_factory=dict)
 
     def rows(self) -> list[Row]:
         """Return the scores by level, with 95 % intervals by resampling of the images."""
@@ -114,7 +126,8 @@ class Robustness:
             name, unit = (quantity.name, quantity.unit) if quantity else ("", "")
             value = float(self.values[level].mean()) if quantity else float("nan")
             estimates = mean_estimate(scores), mean_estimate(self.clean - scores)
-            rows.append(Row(*level, name, value, unit, len(scores), *estimates, self.set_scores[level]))
+            worst = mean_estimate(self.worst_case[level]) if self.worst_case else None
+            rows.append(Row(*level, name, value, unit, len(scores), *estimates, self.set_scores[level], worst))
         return rows
 
     def clean_estimate(self) -> Estimate:
@@ -143,7 +156,8 @@ class Robustness:
 
         Args:
             scene: its name, or None for all.
-            of: "score" for the mean over the images, or the name of a score of all images together, such as "mAP".
+            of: "score" for the mean over the images, "worst_case" for that of their worst cases, or the name of a score
+                of all images together, such as "mAP".
 
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
@@ -152,13 +166,22 @@ class Robustness:
         return float(np.mean(means))
 
     def relative_performance(self, scene: str | None = None, *, of: str = "score") -> float:
-        """Return `mean_performance` divided by the score of the clean images: rPC; NaN if that is 0."""
+        """Return `mean_performance` divided by the score of the clean images: rPC; NaN if that is 0.
+
+        For all scenes it equals the mean resilience rate:
+
+            mRR = mean over scenes of RR,  RR = sum over severities of the score / (number of severities * clean score)
+
+        Source: Michaelis et al., "Benchmarking robustness in object detection", 2019, for rPC; Xie et al., "RoboBEV:
+        towards robust bird's eye view perception under corruptions", 2023, for mRR.
+        """
         return self.mean_performance(scene, of=of) / (self._value(of, None) or float("nan"))
 
     def _value(self, of: str, level: Level | None) -> float:
-        if of != "score":
+        if of not in ("score", "worst_case"):
             return self.set_scores[level][of]
-        return float(self.clean.mean() if level is None else self.scores[level].mean())
+        scores = self.worst_case if of == "worst_case" else self.scores
+        return float(self.clean.mean() if level is None else scores[level].mean())
 
 
 def evaluate(
@@ -173,6 +196,7 @@ def evaluate(
     depth: Callable[[str, Tensor], Tensor | None] | None = None,
     done: Mapping[str, Scored] | None = None,
     on_scored: Callable[[str, Scored], None] | None = None,
+    worst_case_draws: int | None = None,
 ) -> Robustness:
     """Score a model on images as they are, and at each severity of each scene.
 
@@ -189,8 +213,11 @@ def evaluate(
         quantities: of the scenes, by name.
         seed: of the draws.
         depth: returns the depth (1, H, W), m, of an image by its name and itself; None takes that which effects assume.
-        done: scores of an earlier run, by name, which are not computed again.
+        done: scores of an earlier run with the same arguments, by name, which are not computed again.
         on_scored: is called with the name and the scores of each other image.
+        worst_case_draws: number of draws, at least 2, of which the worst for each image, scene and severity is kept: a
+            random search of the parameters within the ranges of each effect. Draw i has the seed `seed + i`, draw 0
+            gives all other scores. Takes as many calls of `predict` for each level; None does not search.
 
     Returns:
         The scores of all images but those whose prediction raised.
@@ -199,15 +226,16 @@ def evaluate(
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
         TypeError: a name that is no text; scenes that are not effects by scene and severity.
         ValueError: an image of another form; a name twice; a target of None without `as_target`; predictions that are
-            not a sequence of one; a score outside [0, 1].
+            not a sequence of one; a score outside [0, 1]; `done` without the worst cases that are asked for.
     """
     quantities, done = dict(quantities or {}), done or {}
+    num_draws = 1 if worst_case_draws is None else check_count("worst_case_draws", worst_case_draws, low=2)
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
     for name, image, given in samples:
         _check_sample(name, image, scored, failures)
         if name in done:
-            scored[name] = done[name]
+            scored[name] = _checked_done(name, done[name], num_draws)
             continue
         if given is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
@@ -219,17 +247,19 @@ def evaluate(
             target = given
             if given is None and as_target is not None:
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
-            clean, by_level = _score(score, prediction, target), {}
-            options = {"seed": seed, "keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            for scene, effects in by_name.items():
+            clean = _score(score, prediction, target)
+            draws: dict[Level, list[ImageScore]] = {}
+            options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
+            for (scene, effects), i in itertools.product(by_name.items(), range(num_draws)):
                 quantity = quantities.get(scene)
                 with sharing_results():  # the severities of a scene have the same random fields
                     for severity, effect in effects.items():
-                        degraded = effect.degrade(image, **options)
+                        degraded = effect.degrade(image, seed=seed + i, **options)
                         prediction = _predict(predict, degraded.image)
                         value = quantity.get(degraded.params).item() if quantity else 0.0
                         moved = move_target(target, degraded, effect)
-                        by_level[Level(scene, severity)] = _score(score, prediction, moved, value)
+                        draws.setdefault(Level(scene, severity), []).append(_score(score, prediction, moved, value))
+            by_level = {level: _with_worst_case(of, seed) for level, of in draws.items()}
         except _PredictionError as error:
             failures[name] = str(error)
         else:
@@ -267,6 +297,13 @@ def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
     if not isinstance(image, Tensor) or image.ndim != 3:
         got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
         raise ValueError(f"samples must have images (3, H, W), tensors, got {got} for {name}")
+
+
+def _checked_done(name: str, scored: Scored, num_draws: int) -> Scored:
+    """Return the scores of an image; raise ValueError if they lack worst cases."""
+    if num_draws > 1 and any(of.worst_case is None for of in scored.levels.values()):
+        raise ValueError(f"done must have worst cases, got none for {name}; score it again")
+    return scored
 
 
 def _checked_scenes(scenes: Any) -> Scenes:
@@ -309,6 +346,14 @@ def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any, val
     return ImageScore(number, value, summarize(prediction, target))
 
 
+def _with_worst_case(draws: Sequence[ImageScore], seed: int) -> ImageScore:
+    """Return the first draw with the lowest score of all, if there are several."""
+    if len(draws) == 1:
+        return draws[0]
+    scores = [of.score for of in draws]
+    return draws[0]._replace(worst_case=min(scores), worst_seed=seed + scores.index(min(scores)))
+
+
 def _collect(
     scored: Mapping[str, Scored], quantities: Mapping[str, Quantity], failures: Mapping[str, str]
 ) -> Robustness:
@@ -318,6 +363,7 @@ def _collect(
         level: [of.levels[level] for of in scored.values()] for level in levels
     }
     of_level[None] = [of.clean for of in scored.values()]
+    searched = [level for level in levels if of_level[level][0].worst_case is not None]
     return Robustness(
         names=list(scored),
         clean=np.array([of.score for of in of_level[None]]),
@@ -328,6 +374,8 @@ def _collect(
             scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
         },
         failures=dict(failures),
+        worst_case={level: np.array([of.worst_case for of in of_level[level]]) for level in searched},
+        worst_seeds={level: np.array([of.worst_seed for of in of_level[level]]) for level in searched},
     )
 
 

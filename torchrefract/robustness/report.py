@@ -76,6 +76,7 @@ def write_tables(result: Robustness, out: Path, about: dict[str, Any], *, loss: 
             for name, value in result.set_scores[None].items()
         },
         "tolerated": {scene: result.tolerated(scene, loss=loss)._asdict() for scene in result.quantities},
+        **({"worst_case": _worst_cases(result)} if result.worst_case else {}),
         "levels": rows,
         "failures": result.failures,
     }
@@ -94,6 +95,7 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         loss: as for `write_tables`.
     """
     names = list(result.set_scores[None])
+    worst = ["worst case"] if result.worst_case else []
     together = f" For {' and '.join(names)}, all images count together." if names else ""
     parts = [
         f"<h1>{html.escape(title)}</h1>",
@@ -109,10 +111,17 @@ def write_report(result: Robustness, examples: Sequence[Example], out: Path, *, 
         _table(["scene", "tolerated", "95 % interval", "quantity"], _tolerated_cells(result, loss)),
         "<h2>Scores</h2>",
         _table(
-            ["scene", "severity", "score", "95 % interval", "drop", *names, "quantity"],
+            ["scene", "severity", "score", "95 % interval", "drop", *worst, *names, "quantity"],
             map(_score_cells, result.rows()),
         ),
     ]
+    if worst:
+        cells = [(name, *map(_number, of.values())) for name, of in _worst_cases(result).items()]
+        parts.append(
+            "<h2>Worst cases</h2><p>The worst case of an image is its lowest score of several random draws of the "
+            "parameters of a scene, the usual draw among them. The numbers are means over images and severities.</p>"
+        )
+        parts.append(_table(["scene", "score", "worst case"], cells))
     if result.failures:
         parts.append(f"<h2>Images left out</h2><p>The model failed for {len(result.failures)} images:</p>")
         parts.append(_table(["image", "reason"], result.failures.items()))
@@ -144,8 +153,21 @@ def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
 def _flat(row: Row) -> dict[str, Any]:
     values = asdict(row) | {"score": row.score.value, "low": row.score.low, "high": row.score.high}
     values |= {"drop": row.drop.value, "drop_low": row.drop.low, "drop_high": row.drop.high}
-    del values["set_scores"]
+    del values["set_scores"], values["worst_case"]
+    if row.worst_case:
+        worst = row.worst_case
+        values |= {"worst_case": worst.value, "worst_case_low": worst.low, "worst_case_high": worst.high}
     return values | row.set_scores
+
+
+def _worst_cases(result: Robustness) -> dict[str, dict[str, float]]:
+    """Return the mean score and the mean worst case of each scene, and of all."""
+    scenes = list(dict.fromkeys(level.scene for level in result.worst_case))
+    kinds = {"mean_performance": "score", "worst_case": "worst_case"}
+    return {
+        scene or "all scenes": {name: result.mean_performance(scene, of=of) for name, of in kinds.items()}
+        for scene in [*scenes, None]
+    }
 
 
 def _without_nan(value: Any) -> Any:
@@ -204,7 +226,8 @@ def _summary_cells(result: Robustness) -> list[tuple[str, ...]]:
 def _score_cells(row: Row) -> tuple[str, ...]:
     value = f"{row.quantity} {row.value:.3g} {row.unit}" if row.quantity else ""
     interval = f"{row.score.low:.3f} to {row.score.high:.3f}"
-    numbers = (_number(value) for value in (row.drop.value, *row.set_scores.values()))
+    worst = [row.worst_case.value] if row.worst_case else []
+    numbers = (_number(value) for value in (row.drop.value, *worst, *row.set_scores.values()))
     return row.scene, str(row.severity), _number(row.score.value), interval, *numbers, value
 
 

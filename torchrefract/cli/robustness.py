@@ -150,8 +150,8 @@ def _check_clean(result: Robustness, folder: _Folder) -> None:
         raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
     if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
         raise UsageError(
-            "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check its "
-            "weights, or pass labels=..."
+            "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check "
+            "its weights, or pass labels=..."
         )
 
 

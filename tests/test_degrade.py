@@ -13,12 +13,12 @@ import torch
 from PIL import Image
 from pycocotools.coco import COCO
 
-from torchrefract import key_of, presets, warp_boxes, warp_mask
+from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
 from torchrefract.data.media import read_video
-from torchrefract.data.pairs.files import decode_flow
+from torchrefract.data.pairs.files import decode_flow, encode_flow
 
 NAMES = ("a.png", "one/b.png", "one/two/c.bmp")
 TIMES_MS = (0, 40, 80, 600)
@@ -359,3 +359,39 @@ def test_another_camera_under_the_name_of_the_first_is_not_mixed_with_its_pictur
         outcome = call("degrade", *words)
         assert outcome.code == code, outcome.err
     assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
+
+
+@pytest.mark.parametrize("kind", [".flo", ".png"])
+def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tmp_path, kind):
+    # The picture moves by 3 px to the right and 1 px up from frame to frame.
+    scene = picture(96, 140, seed=3)
+    motion = np.broadcast_to(np.array([3, -1], np.float32), (72, 96, 2))
+    for i in range(3):
+        write(tmp_path / "raw" / f"{i + 9}.png", scene[10 + i : 82 + i, 20 - 3 * i : 116 - 3 * i])
+        path = tmp_path / "flow" / f"{i + 9}{kind}"
+        path.parent.mkdir(exist_ok=True)
+        if i < 2:
+            data = encode_flow(motion.transpose(2, 0, 1), np.ones((72, 96), bool))
+            assert path.write_bytes(data) if kind == ".png" else cv2.writeOpticalFlow(str(path), motion)
+    words = ("source=raw", "out=out", "scene=paper_refractive", "severity=5", "workers=0", "labels=flow")
+    outcome = call("degrade", *words)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert written(tmp_path / "out" / "labels") == sorted(f"{i}{kind}" for i in (9, 10))
+    effect = presets.paper_refractive(5, width=96)
+    results = [degraded(tmp_path, f"{i}.png", effect) for i in (9, 10, 11)]
+    for i in range(2):
+        path = tmp_path / "out" / "labels" / f"{i + 9}{kind}"
+        if kind == ".png":
+            flow, valid = decode_flow(path.read_bytes())
+        else:
+            flow = cv2.readOpticalFlow(str(path)).transpose(2, 0, 1)
+            valid = np.abs(flow).max(axis=0) < 1e9
+        assert valid.mean() > 0.6
+        moved, _ = warp(results[i + 1].image, torch.from_numpy(np.where(valid, flow, 0).astype(np.float32))[None])
+        miss = (moved - results[i].image).abs()[..., torch.from_numpy(valid)]
+        assert miss.max() < 0.03  # by two interpolations of the picture
+        plain, _ = warp(results[i + 1].image, torch.from_numpy(motion.transpose(2, 0, 1).copy())[None])
+        assert miss.mean() < (plain - results[i].image).abs()[..., torch.from_numpy(valid)].mean() / 5
+    (tmp_path / "raw" / "11.png").unlink()
+    message = call("degrade", *words, "out=more").message
+    assert message.startswith("source must hold the picture after each that has an optical flow, got none after 10.png")

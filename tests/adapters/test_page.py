@@ -20,5 +20,6 @@ def test_a_snippet_of_the_page_runs(code, tmp_path, monkeypatch):
 
 def test_the_page_has_a_snippet_for_each_library():
     libraries = {code.split()[1] for code in SNIPPETS}
-    assert libraries == {"albumentations", "kornia.augmentation", "pytorch_lightning"}
+    assert libraries == {"albumentations", "kornia.augmentation", "pytorch_lightning", "numpy"}
+    assert sum("maite.tasks" in code for code in SNIPPETS) == 1
     assert sum("datasets" in code for code in SNIPPETS) == 1

@@ -31,6 +31,7 @@ from torchrefract.cli.command import (
 )
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
+from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.frames import first_names
 from torchrefract.data.images import is_lost, pixels_of, read_image
 from torchrefract.data.label_files import (
@@ -38,6 +39,7 @@ from torchrefract.data.label_files import (
     CocoAnnotations,
     CocoLabels,
     LabelFolder,
+    MovedLabels,
     PictureLabels,
     read_labels,
 )
@@ -49,13 +51,15 @@ from torchrefract.effects.base import Effect
 from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
+_Labels = CocoLabels | LabelFolder | FlowFolder
+
 _JOURNAL = ".labels.jsonl"  # annotations of finished pictures, for the next run
 
 
 class _Task(NamedTuple):
     file: Path
     name: str  # relative to the source, with forward slashes
-    labels: PictureLabels | None
+    labels: PictureLabels | FlowFile | None
 
 
 class _Result(NamedTuple):
@@ -95,15 +99,10 @@ class Degrader(NamedTuple):
             return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
 
     def _picture(self, task: _Task, path: Path) -> _Result:
-        image = read_image(task.file)[None].contiguous()
-        with _no_warnings():
-            options = {"seed": self.seed, "keys": [key_of(task.name)], "depth": self._depth(task.name, image)}
-            degraded = self._effect(image).degrade(image, **options)
+        degraded = self._degraded(task.file, task.name)
         result = _Result(task.file, task.name, num_frames=1)
         if task.labels:
-            has_flow = degraded.has("flow") and bool(degraded.flow.any())
-            height, width = image.shape[2:]
-            content, num_dropped = task.labels.move(degraded.flow[0] if has_flow else None, (height, width))
+            content, num_dropped = self._moved(task.file, task.labels, degraded)
             result = result._replace(num_dropped=num_dropped)
             if isinstance(task.labels, CocoAnnotations):
                 result = result._replace(annotations=content)
@@ -112,6 +111,23 @@ class Degrader(NamedTuple):
         self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
         media.write_picture(degraded.image[0], path, source=task.file)
         return result
+
+    def _degraded(self, file: Path, name: str) -> Degraded:
+        image = read_image(file)[None].contiguous()
+        with _no_warnings():
+            options = {"seed": self.seed, "keys": [key_of(name)], "depth": self._depth(name, image)}
+            return self._effect(image).degrade(image, **options)
+
+    def _moved(self, file: Path, labels: PictureLabels | FlowFile, degraded: Degraded) -> MovedLabels:
+        if isinstance(labels, FlowFile):
+            following = degraded
+            if degraded.has("flow"):
+                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following)
+            with _no_warnings():
+                return MovedLabels(labels.move(degraded, following), 0)
+        has_flow = degraded.has("flow") and bool(degraded.flow.any())
+        height, width = degraded.image.shape[2:]
+        return labels.move(degraded.flow[0] if has_flow else None, (height, width))
 
     def _video(self, task: _Task, path: Path) -> _Result:
         def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
@@ -216,19 +232,20 @@ def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, n
     check_none_lost([result.error for result in failed if result.is_lost], name="source")
 
 
-def _labels(cfg: DictConfig, pictures: Sequence[str]) -> CocoLabels | LabelFolder | None:
+def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
     """Read the labels and check that each is of a picture."""
     if cfg.labels is None:
         return None
     with naming("mask_fill"):
         fill = check_count("mask_fill", cfg.mask_fill, low=0)
     with naming("labels"):
-        labels = read_labels(Path(str(cfg.labels)).expanduser(), fill=fill)
+        path = Path(str(cfg.labels)).expanduser()
+        labels = read_flows(path) or read_labels(path, fill=fill)
     labels.check(pictures)
     return labels
 
 
-def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: CocoLabels | LabelFolder | None) -> Degrader:
+def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
     effect = make(cfg, "scene")
@@ -257,7 +274,7 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: CocoLabels
     return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels))
 
 
-def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: CocoLabels | LabelFolder | None) -> dict[str, Any]:
+def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None) -> dict[str, Any]:
     """Return everything that decides the output, so that a folder is only continued with the same settings."""
     scene = json.loads(job.scene)
     return {
@@ -273,7 +290,7 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: CocoLabels | L
     }
 
 
-def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: CocoLabels | LabelFolder | None) -> None:
+def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None) -> None:
     messages = media.describe_losses(missing, upright=True)
     if labels:
         messages.append(media.describe_turned(missing, upright=True))

@@ -156,18 +156,13 @@ class LabelFolder(NamedTuple):
 
     def digest(self) -> str:
         """Return a SHA-256 digest of the names and contents of the files."""
-        digest = hashlib.sha256()
-        for path in sorted(self._files()):
-            with path.open("rb") as stream:
-                content = hashlib.file_digest(stream, "sha256").hexdigest()
-            digest.update(ascii((path.relative_to(self.root).as_posix(), content)).encode())
-        return digest.hexdigest()
+        return digest_of(self.root, self._files())
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if a file is of none of the pictures, or if a picture has no mask."""
         expected = {PurePosixPath(name).with_suffix(self.suffix).as_posix() for name in names}
         files = {path.relative_to(self.root).as_posix() for path in self._files()}
-        _check_named(files - expected, self.root)
+        check_named(files - expected, self.root)
         if self.suffix == ".png" and (missing := sorted(expected - files)):
             raise UsageError(
                 f"labels must hold a mask for each picture, got none for {first_names(missing)} in {self.root}; add "
@@ -199,7 +194,7 @@ class CocoLabels(NamedTuple):
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if an image is none of the pictures."""
-        _check_named(self.images.keys() - {*names}, self.path)
+        check_named(self.images.keys() - {*names}, self.path)
 
     def with_moved(self, moved: Mapping[str, list[Annotation]]) -> bytes:
         """Return the JSON with the moved annotations of each picture, in their order, and without other images."""
@@ -256,7 +251,18 @@ def _read_coco(path: Path) -> CocoLabels:
     return CocoLabels(path, document, images, annotations)
 
 
-def _check_named(others: Collection[str], path: Path) -> None:
+def digest_of(root: Path, paths: Iterable[Path]) -> str:
+    """Return a SHA-256 digest of the names, relative to a root, and the contents of files."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        with path.open("rb") as stream:
+            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest.update(ascii((path.relative_to(root).as_posix(), content)).encode())
+    return digest.hexdigest()
+
+
+def check_named(others: Collection[str], path: Path) -> None:
+    """Raise UsageError if there are labels of other names than the pictures."""
     if others:
         raise UsageError(
             f"labels must name pictures of source, got {first_names(sorted(others))} in {path}, which source does not "

@@ -232,6 +232,16 @@ def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_s
     assert "cheap_dashcam: k1 all tested, the strongest -0." in outcome.out
 
 
+def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(call, tmp_path, frames):
+    for path in frames.iterdir():
+        cv2.imwrite(str(path), np.full((72, 128, 3), 90, np.uint8))
+    message = call(*COMMAND, "scene=cheap_dashcam", "severity=5").message
+    assert message.startswith(
+        "model must detect something with a score of at least 0.5 in a clean picture, got nothing"
+    )
+    assert not list(tmp_path.glob("out/results*"))
+
+
 def test_masks_and_modules_are_taken(call, tmp_path, frames):
     masks = tmp_path / "masks"
     masks.mkdir()
@@ -255,7 +265,7 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
     ("word", "message"),
     [
         ("model=nothing:here", "model: a function must be package.module:name that can be imported, got nothing:here"),
-        ("model=bright", "model: model must be package.module:name, torchvision:name, opencv:hog or a file"),
+        ("model=bright", "model: model must be package.module:name, torchvision:name, transformers:name, "),
         ("model=lost.onnx", "model: model must be a file that exists, got lost.onnx"),
         ("model=torchvision:no_such_net", "model: model must be one of torchvision.models.list_models()"),
         ("data=empty", "data must be a folder of pictures, got empty, which holds none"),

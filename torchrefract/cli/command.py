@@ -243,13 +243,13 @@ def make(cfg: DictConfig, part: str) -> Any:
 def naming(part: str) -> Iterator[None]:
     """Turn errors of values inside the block into UsageError, with the name of a part of the configuration.
 
-    Errors of files stay as they are, since they name the file.
+    Errors of files and missing modules stay as they are, since they name the file, and `command` the extra.
     """
     try:
         yield
-    except _FILE_ERRORS:
+    except (*_FILE_ERRORS, ModuleNotFoundError):
         raise
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:
         raise UsageError(f"{part}: {error}") from error
 
 

@@ -42,7 +42,7 @@ from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored, evaluate, move_target
-from torchrefract.robustness.predictors import Predict, import_function, load_predictor
+from torchrefract.robustness.predictors import Predict, import_function, load_predictor, model_files
 from torchrefract.robustness.quantities import QUANTITIES
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
 from torchrefract.robustness.scores import (
@@ -110,11 +110,13 @@ def test_robustness(cfg: DictConfig) -> None:
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     values["camera"] = folder.camera and json.loads(json.dumps(asdict(folder.camera)))  # as it is stored
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
-    settings |= {"worst_case_draws": num_draws, "format": _FORMAT, "files": file_digests([cfg.model, cfg.weights])}
+    settings |= {"worst_case_draws": num_draws, "format": _FORMAT}
     levels = _levels(settings["scene"], settings["severity"])
     base = None if cfg.base is None else _read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
+    # Ultralytics may have downloaded the file just now.
+    settings["files"] = file_digests([*model_files(str(cfg.model)), cfg.weights])
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: _scenes(levels, width, folder.place))
@@ -136,8 +138,7 @@ def test_robustness(cfg: DictConfig) -> None:
             raise UsageError(f"model: {error}") from error
         except ValueError as error:
             raise UsageError(str(error)) from error
-        if not result.clean.any():
-            raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
+        _check_clean(result, folder)
         about = settings | {
             "metric": _metric(cfg, out / _SCORES),
             "torchrefract": torchrefract.__version__,
@@ -194,6 +195,17 @@ def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> Non
         if num_draws:
             mean, worst = result.mean_performance(scene), result.mean_performance(scene, of="worst_case")
             print(f"{scene}: mean score {mean:.3f}, of the worst of {num_draws} draws {worst:.3f}")
+
+
+def _check_clean(result: Robustness, folder: _Folder) -> None:
+    """Raise UsageError if the scores of the clean pictures say nothing about the model."""
+    if not result.clean.any():
+        raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
+    if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
+        raise UsageError(
+            "model must detect something with a score of at least 0.5 in a clean picture, got nothing in all: check "
+            "its weights, or pass labels=..."
+        )
 
 
 def choose_score(prediction: Any, target: Any) -> float:

@@ -7,10 +7,12 @@ its agreement with that for the clean picture. A run that is stopped continues w
 
 Options:
     model=NAME              required: package.module:name of a function from images (1, 3, H, W) in [0, 1] to
-                            predictions, torchvision:NAME, opencv:hog (pedestrians), or a file .pt2, .onnx or .pt
+                            predictions, torchvision:NAME, transformers:NAME or a folder, ultralytics:FILE (.pt of
+                            YOLO), opencv:hog (pedestrians), or a file .pt2, .onnx or .pt
     data=DIR                folder of pictures, required
     out=DIR                 output folder, required
-    labels=PATH             COCO JSON, or a folder of YOLO files or of masks with the names of the pictures
+    labels=PATH             COCO JSON, or a folder of YOLO files or of masks with the names of the pictures; its
+                            classes must have the numbers of those of the model
     scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ...
     severity=[1,3,5]        1 to 5
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]

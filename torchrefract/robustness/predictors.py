@@ -16,6 +16,10 @@ from torch import Tensor, nn
 
 _PROGRAMS = (".pt2", ".onnx", ".pt")
 _HOG_SCALE = 4.0  # a margin that counts as certain
+_LEAST_SCORE = 0.05  # of detections, as in torchvision
+_TASKS = ("ObjectDetection", "SemanticSegmentation", "ImageClassification")  # in names of classes of transformers
+_STORED = (".json", ".safetensors", ".bin")  # files of a model of transformers
+_BOX_TASKS = ("detect", "segment", "pose")  # of Ultralytics
 
 Predict = Callable[[Tensor], Any]
 
@@ -29,6 +33,10 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
                 import from here.
             "torchvision:name": a detector, segmenter or classifier of `torchvision.models`, such as
                 "torchvision:fasterrcnn_resnet50_fpn".
+            "transformers:name": a detector, semantic segmenter or classifier of the Hugging Face hub, or of a folder
+                that `save_pretrained` wrote, such as "transformers:hustvl/yolos-tiny".
+            "ultralytics:file": a YOLO file (.pt), or the name of an architecture (.yaml) with random weights; boxes,
+                also of models that segment or find keypoints.
             "opencv:hog": the pedestrian detector of OpenCV (Dalal and Triggs 2005), which needs no weights; its scores
                 are the margins of its classifier, divided by 4.
             a file: .pt2 of torch.export or .onnx, whose first output counts, or .pt of TorchScript: scores (1, K) or
@@ -37,23 +45,29 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
         device: of models in PyTorch.
 
     Returns:
-        A function without gradients.
+        A function without gradients. Detections of transformers and Ultralytics have scores of at least 0.05.
 
     Raises:
+        ImportError: the library of the model is not installed.
         ValueError: the model has another form, or cannot be found.
     """
     kind, _, name = model.partition(":")
-    if Path(model).suffix in _PROGRAMS:
-        predict = _load_program(Path(model), device)
-    elif kind == "torchvision":
+    if kind == "torchvision":
         predict = _load_torchvision(name, weights, device)
+    elif kind == "transformers":
+        predict = _load_transformers(os.path.expanduser(name), device)
+    elif kind == "ultralytics":
+        predict = _load_ultralytics(os.path.expanduser(name), device)
+    elif Path(model).suffix in _PROGRAMS:
+        predict = _load_program(Path(model), device)
     elif model == "opencv:hog":
         predict = HogDetector()
     elif name:
         predict = import_function(kind, name, device)
     else:
         raise ValueError(
-            f"model must be package.module:name, torchvision:name, opencv:hog or a file .pt2, .onnx or .pt, got {model}"
+            "model must be package.module:name, torchvision:name, transformers:name, ultralytics:file, opencv:hog or a "
+            f"file .pt2, .onnx or .pt, got {model}"
         )
 
     def without_gradient(images: Tensor) -> Any:
@@ -65,6 +79,14 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
     return without_gradient
 
 
+def model_files(model: str) -> list[str]:
+    """Return the paths of the files that a model of `load_predictor` is loaded from, as far as they are local."""
+    kind, _, name = model.partition(":")
+    path = Path(name).expanduser() if kind in ("transformers", "ultralytics") else Path(model)
+    files = [file for file in sorted(path.iterdir()) if file.suffix in _STORED] if path.is_dir() else [path]
+    return [str(file) for file in files if file.is_file()]
+
+
 class HogDetector:
     """The pedestrian detector of OpenCV: boxes of class 1."""
 
@@ -74,7 +96,7 @@ class HogDetector:
 
     def __call__(self, images: Tensor) -> list[dict[str, Tensor]]:
         """Detect pedestrians in images (B, 3, H, W)."""
-        return [self._detect((255 * image).round().byte().movedim(0, -1).cpu().numpy()) for image in images]
+        return [self._detect(image.movedim(0, -1).cpu().numpy()) for image in _as_bytes(images)]
 
     def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
         corners, weights = (), ()
@@ -85,6 +107,11 @@ class HogDetector:
         scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
         boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
         return {"boxes": boxes, "labels": torch.ones(len(boxes), dtype=torch.int64), "scores": scores.clamp(0, 1)}
+
+
+def _as_bytes(images: Tensor) -> Tensor:
+    """Return images as uint8, which is what libraries read from files."""
+    return (255 * images).round().clamp(0, 255).byte()
 
 
 def _load_program(path: Path, device: str) -> Predict:
@@ -117,7 +144,8 @@ def _naming(rule: str) -> Iterator[None]:
     except ImportError:
         raise
     except Exception as error:  # PyTorch and ONNX Runtime raise errors of many types
-        raise ValueError(f"{rule} ({str(error).splitlines()[0]})") from error
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{rule} ({reason})") from error
 
 
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
@@ -140,6 +168,69 @@ def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
     prepare = stored.transforms(resize_size=None) if kind == "segmentation" else stored.transforms()
     network = network.eval().to(device)
     return lambda images: network(prepare(images))
+
+
+def _load_transformers(name: str, device: str) -> Predict:
+    with _installed("transformers", 'pip install "torchrefract[depth]"', name):
+        import transformers  # noqa: PLC0415 - an extra
+
+    options: dict[str, Any] = {"local_files_only": os.path.isdir(name)}
+    rule = (
+        "model must be one of the Hugging Face hub that can be reached, or a folder of one (download it elsewhere and "
+        f"pass the folder), got {name}"
+    )
+    with _naming(rule):
+        config = transformers.AutoConfig.from_pretrained(name, **options)
+    architecture = " ".join(config.architectures or [])
+    task = next((task for task in _TASKS if task in architecture), None)
+    if task is None:
+        raise ValueError(
+            f"model must be a detector, a semantic segmenter or a classifier, got {name} of {architecture or 'no kind'}"
+        )
+    with _naming(rule):
+        processor = transformers.AutoImageProcessor.from_pretrained(name, **options)
+        network = getattr(transformers, f"AutoModelFor{task}").from_pretrained(name, **options)
+    network.eval().to(device)
+    if task == "SemanticSegmentation":
+        processor.do_center_crop = False  # the library would stretch the classes of the crop over the frame
+
+    def predict(images: Tensor) -> Any:
+        outputs = network(**processor(images=list(_as_bytes(images)), return_tensors="pt").to(device))
+        sizes = [tuple(images.shape[2:])] * len(images)
+        if task == "ObjectDetection":
+            return processor.post_process_object_detection(outputs, threshold=_LEAST_SCORE, target_sizes=sizes)
+        if task == "SemanticSegmentation":
+            return processor.post_process_semantic_segmentation(outputs, target_sizes=sizes)
+        return outputs.logits
+
+    return predict
+
+
+def _load_ultralytics(name: str, device: str) -> Predict:
+    with _installed("ultralytics", "pip install ultralytics", name):
+        from ultralytics import YOLO  # noqa: PLC0415 # pyright: ignore[reportMissingImports]  # in no extra
+
+    with _naming(f"model must be a file of YOLO (.pt) or the name of an architecture (.yaml), got {name}"):
+        network = YOLO(name)
+    if network.task not in _BOX_TASKS:
+        raise ValueError(f"model must detect, segment or pose, got {name} of the task {network.task}")
+
+    def predict(images: Tensor) -> list[dict[str, Tensor]]:
+        # Arrays are padded to the size of the network like files; tensors are taken as they are.
+        arrays = list(_as_bytes(images).flip(1).movedim(1, -1).contiguous().cpu().numpy())  # BGR
+        results = network.predict(arrays, conf=_LEAST_SCORE, device=device, verbose=False)
+        boxes = [result.boxes for result in results]
+        return [{"boxes": box.xyxy, "labels": box.cls.long(), "scores": box.conf} for box in boxes]
+
+    return predict
+
+
+@contextmanager
+def _installed(library: str, remedy: str, name: str) -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"{library}:{name} needs {library}: {remedy} ({error})") from error
 
 
 def import_function(module: str, name: str, device: str = "cpu") -> Callable[..., Any]:

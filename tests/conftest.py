@@ -2,13 +2,12 @@ import gc
 import importlib
 import logging
 import math
-import multiprocessing
 import os
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -289,37 +288,10 @@ def spawn() -> Callable[..., Outcome]:
 
 
 @pytest.fixture(scope="session")
-def fork() -> Callable[..., Any]:
-    """Return a function that starts a function in a forked process, which has imported what this one has.
-
-    The process writes out.txt and err.txt to its folder.
-    """
-
-    def start(function: Callable[..., Any], *arguments: Any, argv: Sequence[str], cwd: Path) -> Any:
-        def run() -> None:
-            os.chdir(cwd)
-            os.environ["OMP_NUM_THREADS"] = "1"
-            torch.set_num_threads(1)  # the threads of the parent are missing in its child
-            sys.argv = ["torchrefract.train", *argv]
-            with open("out.txt", "a", buffering=1) as sys.stdout, open("err.txt", "a", buffering=1) as sys.stderr:
-                os.dup2(sys.stdout.fileno(), 1)
-                os.dup2(sys.stderr.fileno(), 2)
-                function(*arguments)
-
-        process = multiprocessing.get_context("fork").Process(target=run)
-        process.start()
-        return process
-
-    return start
-
-
-@pytest.fixture(scope="session")
-def trained(tmp_path_factory, fork, small) -> Trained:
-    """Run a training of two epochs by its command, in a forked process."""
-    words, folder = ("+task=undistort", *small), tmp_path_factory.mktemp("trained")
-    process = fork(lambda: importlib.import_module("torchrefract.train").main(), argv=words, cwd=folder)
-    process.join(timeout=300)
-    outcome = Outcome(process.exitcode, *((folder / f"{name}.txt").read_text() for name in ("out", "err")))
+def trained(tmp_path_factory, spawn, small) -> Trained:
+    """Run a training of two epochs by its command."""
+    words = ("+task=undistort", *small)
+    outcome = spawn("-m", "torchrefract.train", *words, cwd=tmp_path_factory.mktemp("trained"))
     return Trained(words, outcome, outcome.folder)
 
 

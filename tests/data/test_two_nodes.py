@@ -1,64 +1,66 @@
 """A training on two nodes, each started by torchrun as on a machine of its own."""
 
-import importlib
 import os
 import socket
+import subprocess
+import sys
 from collections import Counter
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import pytest
 
 from torchrefract.data.pairs import PairedFolder
 
 pytest.importorskip("webdataset")  # in its own extra
+ROOT = Path(__file__).parents[2]
+# Runs the command, and writes the keys of each batch.
+SCRIPT = """
+import os
+from torchrefract.restoration.module import Restoration
+from torchrefract.train import main
 
-
-def noting(name: str, step: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a step of Lightning's that writes the keys of its batch first."""
-
-    def noted(self, batch: Any, index: int) -> Any:
+def noted(name):
+    step = getattr(Restoration, name)
+    def run(self, batch, index):
         with open(f"{name}-{os.environ['RANK']}.txt", "a") as file:
-            file.writelines(f"{key}\n" for key in batch.key.tolist())
+            file.writelines(f"{key}\\n" for key in batch.key.tolist())
         return step(self, batch, index)
+    setattr(Restoration, name, run)
 
-    return noted
-
-
-def train_and_note_keys() -> None:
-    """Run the command, and write the keys of each batch."""
-    restoration = importlib.import_module("torchrefract.restoration.module").Restoration
-    for name in ("training_step", "validation_step"):
-        setattr(restoration, name, noting(name, getattr(restoration, name)))
-    importlib.import_module("torchrefract.train").main()
+noted("training_step")
+noted("validation_step")
+main()
+"""
 
 
-def start_node(*words: str) -> None:
-    """Do what torchrun does, but fork the process of the training, which then need not import everything again."""
-    run = importlib.import_module("torch.distributed.run")
-    config, _, _ = run.config_from_args(run.parse_args([*words, "torchrefract.train"]))
-    config.start_method = "fork"
-    run.elastic_launch(config, train_and_note_keys)()
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-def test_two_nodes_train_on_each_pair_once_and_validate_each_once(tars, small, tmp_path, fork, monkeypatch):
+def test_two_nodes_train_on_each_pair_once_and_validate_each_once(tars, small, tmp_path):
+    (tmp_path / "torchrefract_train.py").write_text(SCRIPT)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     words = ["+task=undistort", "data=pairs", f"data.root={tars}", "data.buffer=8", "data.batch_size=3"]
     words += ["data.workers=1", "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2"]
-    words += [word for word in small if not word.startswith("data.")] + ["trainer.max_epochs=1", "run_dir=run"]
-    agent = ["--nnodes=2", "--nproc-per-node=1", "--master-addr=127.0.0.1", f"--master-port={port}"]
-    monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
-    nodes = [fork(start_node, *agent, f"--node-rank={rank}", argv=words, cwd=tmp_path) for rank in range(2)]
+    words += [word for word in small if not word.startswith("data.")] + ["trainer.max_epochs=1"]
+    agent = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
+    agent += ["--master-addr=127.0.0.1", f"--master-port={port}"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
+    options = {
+        "cwd": tmp_path,
+        "env": environment,
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.STDOUT,
+        "text": True,
+    }
+    nodes = [
+        subprocess.Popen([*agent, f"--node-rank={rank}", "torchrefract_train.py", *words, "run_dir=run"], **options)
+        for rank in range(2)
+    ]
     try:
-        for node in nodes:
-            node.join(timeout=200)
+        output = [node.communicate(timeout=200)[0] for node in nodes]
     finally:
         for node in nodes:
             node.kill()
-    assert [node.exitcode for node in nodes] == [0, 0], (tmp_path / "err.txt").read_text()
+    assert [node.returncode for node in nodes] == [0, 0], "\n".join(output)
     for name, split in (("training_step", "train"), ("validation_step", "val")):
         expected = Counter(row.key for row in PairedFolder(tars, split=split).rows())
         parts = [(tmp_path / f"{name}-{rank}.txt").read_text().splitlines() for rank in range(2)]

@@ -195,8 +195,8 @@ def test_threads_that_share_an_effect_get_the_results_and_gradients_of_one_threa
 
     def call(effect: Effect, number: int) -> tuple[dict[str, Tensor], Tensor]:
         scale = step * (number // THREADS % 7)
-        image = frame(number, size=(HEIGHT + 4 * scale, WIDTH + 6 * scale)).requires_grad_()
-        degraded = effect.degrade(image, seed=7, keys=[number])
+        image = frame(number, size=(HEIGHT + 4 * scale, WIDTH + 6 * scale), batch=2).requires_grad_()
+        degraded = effect.degrade(image, seed=7, keys=[number, -number])
         (gradient,) = torch.autograd.grad(degraded.image.square().sum(), image)
         return maps_of(degraded), gradient
 
@@ -208,13 +208,13 @@ def test_threads_that_share_an_effect_get_the_results_and_gradients_of_one_threa
         torch.testing.assert_close(gradient, expected_gradient, rtol=1e-4, atol=1e-4)
 
 
-def test_an_effect_can_be_copied_while_threads_call_it(make):
+@pytest.mark.parametrize("copy_effect", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_an_effect_can_be_copied_while_threads_call_it(make, copy_effect):
     effect, image = make(), frame()
     expected = maps_of(effect.degrade(image, seed=7))
-    ways = (lambda value: value, copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value)))
 
     def call(number: int) -> dict[str, Tensor]:
-        return maps_of(ways[number % len(ways)](effect).degrade(image, seed=7))
+        return maps_of((copy_effect(effect) if number % 2 else effect).degrade(image, seed=7))
 
     for maps in call_in_threads(call, 2 * THREADS):
         assert_close_maps(maps, expected)

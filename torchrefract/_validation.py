@@ -13,6 +13,7 @@ from torch.autograd import forward_ad
 from torchrefract.types import Range
 
 _LARGEST = sys.float_info.max
+_SHOWN = 3  # examples in a message
 
 
 class UsageError(Exception):
@@ -203,6 +204,12 @@ def _has_memory(value: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def first_names(names: Sequence[str]) -> str:
+    """Join the first names and the number of the others, for a message."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
 
 
 def _check_real(name: str, value: float) -> float:

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from torchrefract._io import replace_file
-from torchrefract._validation import UsageError, check_choice, check_count, check_positive
+from torchrefract._validation import UsageError, check_choice, check_count, check_positive, first_names
 from torchrefract.cli.command import (
     check_none_lost,
     check_seed,
@@ -32,7 +32,6 @@ from torchrefract.cli.command import (
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
-from torchrefract.data.frames import first_names
 from torchrefract.data.images import is_lost, pixels_of, read_image
 from torchrefract.data.label_files import (
     Annotation,

@@ -28,10 +28,11 @@ from torchrefract._validation import (
     check_number,
     check_positive,
     check_size,
+    first_names,
 )
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, first_names
+from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.files import FORMATS

@@ -9,10 +9,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchrefract._io import as_path, read_bytes
-from torchrefract._validation import UsageError, check_flag
+from torchrefract._validation import UsageError, check_flag, first_names
 from torchrefract.cli.command import naming
 from torchrefract.cli.generation import disk_errors, list_unreadable
-from torchrefract.data.frames import first_names
 from torchrefract.data.images import opened
 from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.manifest import Manifest, find_manifests, locked_shard, scan_rows

@@ -22,12 +22,12 @@ from torchvision import tv_tensors
 import torchrefract
 from torchrefract import presets, random
 from torchrefract._io import replace_file
-from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive
+from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive, first_names
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import first_names, list_files
+from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
 from torchrefract.data.label_files import (
     CocoLabels,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torchrefract._validation import UsageError
-from torchrefract.data.frames import first_names, list_files
+from torchrefract._validation import UsageError, first_names
+from torchrefract.data.frames import list_files
 from torchrefract.data.images import opened
 from torchrefract.data.label_files import check_named, digest_of
 from torchrefract.data.pairs.files import DamagedPairError, decode_flow, encode_flow

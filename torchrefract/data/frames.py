@@ -18,7 +18,7 @@ from typing import NamedTuple, NoReturn
 import torch
 from torch.utils.data import Dataset
 
-from torchrefract._validation import check_choice, check_number, check_size
+from torchrefract._validation import check_choice, check_number, check_size, first_names
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image, warn_of_unread
 from torchrefract.random import key_of
@@ -27,7 +27,7 @@ from torchrefract.types import Frame
 _SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # folder names
 _UNNAMED = "."  # the drive of frames in the root itself, or with bare numbers as names
 _MAX_UNREADABLE = 0.1  # share of the frames
-_SHOWN = 3  # examples in a message
+_FEW = 3  # frames, which may be one of each drive
 _DATE = re.compile(r"(?:^|.*?[^0-9])(?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?=[-_. T]?\d\d[-_.:]?\d\d[-_.:]?\d\d$)")
 _NUMBERED = re.compile(r"\d[A-Za-z]?$")
 _NUMBER = re.compile(r"[-_.\s\d]*\d[A-Za-z]?")
@@ -278,7 +278,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
             f"root must hold two or more drives to be split, got one, {next(iter(frames))!r}, in {root}; put each "
             "drive in a sub-folder of its own, or name its frames <drive>_<number>, or make sub-folders train and val"
         )
-    if 2 * len(frames) > len(drive_of) > _SHOWN:
+    if 2 * len(frames) > len(drive_of) > _FEW:
         names = first_names(sorted(frames))
         message = (
             f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
@@ -324,9 +324,3 @@ def _size_or_reason(path: Path) -> tuple[int, int] | str:
         return image_size(path)
     except UnreadableImageError as error:
         return str(error).removeprefix(f"{path} ")
-
-
-def first_names(names: Sequence[str]) -> str:
-    """Join the first names and the number of the others, for a message."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

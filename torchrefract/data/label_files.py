@@ -19,8 +19,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchrefract._validation import UsageError
-from torchrefract.data.frames import first_names, list_files
+from torchrefract._validation import UsageError, first_names
+from torchrefract.data.frames import list_files
 from torchrefract.data.images import image_header, opened
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask

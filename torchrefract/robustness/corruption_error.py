@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchrefract.data.frames import first_names
+from torchrefract._validation import first_names
 from torchrefract.robustness.evaluate import Robustness
 
 _NO_ERROR = 1e-6  # of a mean score, which rounding leaves

@@ -21,12 +21,13 @@ def start(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.fixture
-def complete(call, tmp_path_factory, words) -> Path:
-    """A set made by one uninterrupted run, once for all tests."""
-    out = tmp_path_factory.getbasetemp() / "complete" / "out"
-    if not out.exists():
-        assert call("generate", *words(out, f"count={COUNT}")).code == 0
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory, words) -> Path:
+    """A set made by one uninterrupted run."""
+    out = tmp_path_factory.mktemp("complete") / "out"
+    run = start(*words(out, f"count={COUNT}"))
+    _, err = run.communicate(timeout=300)
+    assert run.returncode == 0, err
     return out
 
 

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from torchrefract._io import is_remote, read_bytes, replace_file, retried
-from torchrefract._validation import UsageError
+from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, first_names, list_names, select_val_drives, split_frames
+from torchrefract.data.frames import Source, list_names, select_val_drives, split_frames
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
 from torchrefract.data.media import VIDEOS, video_info
 from torchrefract.random import key_of

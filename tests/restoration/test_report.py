@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import BboxImage
 from torch import Tensor, nn
 
-from torchrefract import Pair, presets
+from torchrefract import Pair, Turbulence, presets
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import road_scenes
 from torchrefract.restoration import report
@@ -29,7 +29,7 @@ from torchrefract.restoration.report import (
     summary,
     verdict,
 )
-from torchrefract.restoration.tasks import Deweather, Restored, Undistort
+from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.visualization.color import flow_to_rgb
 
 # CSVLogger writes a row for validation and a row for training in each epoch, most cells empty.
@@ -347,12 +347,13 @@ def test_a_training_warns_of_drives_whose_camera_has_a_lens(tmp_path, capsys, mo
     frames = FrameFolder(tmp_path, size=(40, 60))
     monkeypatch.setattr(report, "describe_training", lambda *_: ["frames 1"])
     monkeypatch.setattr(report, "bent_drives", lambda given: {"fort": 0.0213, "reef": 0.004} if given is frames else {})
-    trainer: Any = SimpleNamespace(is_global_zero=True, datamodule=SimpleNamespace(train=frames))
-    for task in (Undistort(), Deweather()):
-        model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), task)
+    model = Restoration(lambda channels, smooth: nn.Conv2d(3, channels, 1), Undistort())
+    for effect in (presets.paper_refractive(), Turbulence(), None):  # the first one draws lenses, among others
+        data = SimpleNamespace(train=frames, effect=effect)
+        trainer: Any = SimpleNamespace(is_global_zero=True, datamodule=data)
         RunSummary(str(tmp_path)).on_train_start(trainer, model)
-    first, warning, other = capsys.readouterr().out.splitlines()
-    assert first == other == "frames 1"
+    first, warning, *others = capsys.readouterr().out.splitlines()
+    assert [first, *others] == 3 * ["frames 1"]
     assert warning.startswith("warning: the camera of fort, reef has a lens")
     assert "up to 2.1% of the width" in warning
     assert "torchrefract.estimate_lens" in warning

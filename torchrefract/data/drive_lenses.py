@@ -1,6 +1,7 @@
 """Find drives whose frames show the lens of their own camera, from which a network would learn a wrong lens."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -42,18 +43,28 @@ def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
     return [items[i * len(items) // number] for i in range(number)]
 
 
-def _edge_shift(paths: list[Path]) -> float:
+def _edge_shift(paths: Sequence[Path]) -> float:
     """Return how far the lens of a drive shifts the left and right edge, in widths; 0 if none can be distinguished."""
-    images: list[Tensor] = []
-    for path in paths:
-        try:
-            images.append(read_image(path))
-        except UnreadableImageError:  # the training names them
-            continue
-    images = [image for image in images if image.shape == images[0].shape]
-    if not images or not (estimate := estimate_lens(images)).is_distorted:
+    images = _of_one_size(paths)
+    if (first := next(images, None)) is None:
+        return 0.0
+    estimate = estimate_lens(chain([first], images))
+    if not estimate.is_distorted:
         return 0.0
     focal = estimate.camera.fx / estimate.camera.width
     k1, k2, *_ = estimate.camera.coefficients
     edge = 0.5 / focal
     return abs(k1 * edge**3 + k2 * edge**5) * focal
+
+
+def _of_one_size(paths: Sequence[Path]) -> Iterator[Tensor]:
+    """Read the pictures that have the size of the first one; leave out those that cannot be read."""
+    shape = None
+    for path in paths:
+        try:
+            image = read_image(path)
+        except UnreadableImageError:  # `FrameFolder` and the training name them
+            continue
+        shape = shape or image.shape
+        if image.shape == shape:
+            yield image

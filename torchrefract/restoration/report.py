@@ -21,11 +21,12 @@ from torchrefract._io import as_path, is_remote, matching_files, replace_file
 from torchrefract.data.drive_lenses import bent_drives
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import PairData, fingerprint
+from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.models.lens_net import LensNet
 from torchrefract.restoration.module import RestorationModule
-from torchrefract.restoration.tasks import Restored, Undistort
+from torchrefract.restoration.tasks import Restored
 from torchrefract.types import Pair
 from torchrefract.visualization.color import flow_to_rgb, full_color_px, hatch_invalid
 from torchrefract.visualization.figures import MapScale, draw_invalid_key, draw_legend
@@ -62,10 +63,10 @@ class RunSummary(Callback):
             carry_over(self.resumed_run, self.run_dir, before_epoch=trainer.current_epoch)
         if isinstance(pl_module, RestorationModule):
             print("\n".join(describe_training(trainer, pl_module)), flush=True)
-            frames = trainer.datamodule.train  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
-            if isinstance(pl_module.task, Undistort) and isinstance(frames, FrameFolder):
-                for warning in describe_bent(bent_drives(frames)):
-                    print(warning, flush=True)
+            data = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
+            has_lenses = _draws_lenses(data.effect) and isinstance(data.train, FrameFolder)
+            if has_lenses and (shifts := bent_drives(data.train)):
+                print(describe_bent(shifts), flush=True)
 
     def on_validation_batch_end(
         self,
@@ -136,15 +137,17 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
     return [f"{name:<12}{text}" for name, text in lines.items()]
 
 
-def describe_bent(shifts: Mapping[str, float]) -> list[str]:
-    """Warn of drives whose frames are bent themselves, one line or none; arguments as returned by `bent_drives`."""
-    if not shifts:
-        return []
-    return [
+def _draws_lenses(effect: Effect | None) -> bool:
+    return effect is not None and any(isinstance(part, LensDistortion) for part in effect.modules())
+
+
+def describe_bent(shifts: Mapping[str, float]) -> str:
+    """Return a warning of the drives that `bent_drives` returned."""
+    return (
         f"warning: the camera of {', '.join(shifts)} has a lens, which shifts the left and right edge by up to "
         f"{max(shifts.values()):.1%} of the width. The network will not learn it, and so learns a wrong lens: take it "
         "out first, by `python -m torchrefract.estimate_lens` and `rectify`"
-    ]
+    )
 
 
 def describe_scene(data: PairData, config: Mapping[str, Any] | None) -> str:

@@ -5,7 +5,6 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict
 from functools import lru_cache
 from itertools import islice
@@ -21,11 +20,11 @@ from torchvision import tv_tensors
 
 import torchrefract
 from torchrefract import presets, random
-from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive, first_names
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_scores, read_base, stored_scores
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
@@ -41,7 +40,7 @@ from torchrefract.data.label_files import (
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
-from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored, evaluate, move_target
+from torchrefract.robustness.evaluate import Level, Robustness, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor, model_files
 from torchrefract.robustness.quantities import QUANTITIES
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
@@ -53,12 +52,8 @@ from torchrefract.robustness.scores import (
     segmentation_score,
 )
 
-_SCORES = "scores.jsonl"  # one line of settings, then one for each picture
-_FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
-# Settings that a base shares, besides its data, scenes and severities.
-_SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 _SETTINGS += ("camera", "horizon")
@@ -110,9 +105,9 @@ def test_robustness(cfg: DictConfig) -> None:
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     values["camera"] = folder.camera and json.loads(json.dumps(asdict(folder.camera)))  # as it is stored
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
-    settings |= {"worst_case_draws": num_draws, "format": _FORMAT}
-    levels = _levels(settings["scene"], settings["severity"])
-    base = None if cfg.base is None else _read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
+    settings |= {"worst_case_draws": num_draws, "format": FORMAT}
+    levels = levels_of(settings["scene"], settings["severity"])
+    base = None if cfg.base is None else read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
     # Ultralytics may have downloaded the file just now.
@@ -124,7 +119,7 @@ def test_robustness(cfg: DictConfig) -> None:
         warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    with locked("out", out), _stored_scores(out / _SCORES, settings) as (done, store), warnings.catch_warnings():
+    with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
@@ -140,7 +135,7 @@ def test_robustness(cfg: DictConfig) -> None:
             raise UsageError(str(error)) from error
         _check_clean(result, folder)
         about = settings | {
-            "metric": _metric(cfg, out / _SCORES),
+            "metric": _metric(cfg, out / SCORES),
             "torchrefract": torchrefract.__version__,
             "torch": torch.__version__,
         }
@@ -226,22 +221,11 @@ def _worst_case_draws(cfg: DictConfig) -> int | None:
     return num_draws if is_searched else None
 
 
-def _levels(scenes: Any, severities: Any) -> list[Level]:
-    names = [scenes] if isinstance(scenes, str) else scenes or []
-    unknown = [name for name in names if name not in QUANTITIES]
-    if unknown or not names:
-        raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, got {', '.join(unknown) or 'none'}")
-    severities = [severities] if isinstance(severities, int | float) else severities
-    if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
-        raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
-    return [Level(name, int(severity)) for name in names for severity in severities]
-
-
 def _metric(cfg: DictConfig, path: Path) -> str:
     """Return the name of the score of a picture, by the first of the stored ones."""
     if cfg.score is None:
         with path.open(encoding="utf-8") as lines:
-            _, scored = _parse_scores(list(islice(lines, 2))[1])
+            _, scored = parse_scores(list(islice(lines, 2))[1])
         name = _METRICS[scored.clean.summary[0] if scored.clean.summary else None]
     else:
         name = str(cfg.score)
@@ -330,82 +314,6 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
     boxes = tv_tensors.BoundingBoxes(torch.tensor(boxes, dtype=torch.float32).view(-1, 4), **options)
     return {"boxes": boxes, "labels": torch.tensor(classes, dtype=torch.int64)}
-
-
-def _read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Robustness]:
-    """Return the model and the scores of an earlier run.
-
-    Raises:
-        UsageError: the folder has no run; its settings are others; it has none of the pictures.
-    """
-    lines = _complete_lines(path / _SCORES)
-    if not lines:
-        raise UsageError(f"base must be a folder of an earlier run, got {path}, which has no {_SCORES}")
-    before, scored = json.loads(lines[0]), dict(map(_parse_scores, lines[1:]))
-    expected, of_base = _comparable(settings), _comparable(before)
-    changed = [f"{name}={of_base[name]}" for name in expected if of_base[name] != expected[name]]
-    if changed:
-        raise UsageError(
-            f"base must be a run on the same data with the same settings, got one with {', '.join(changed)}; score "
-            "that model again with the options of this run"
-        )
-    if scored.keys().isdisjoint(names):
-        raise UsageError(f"base must have scores of the same images, got none of {first_names(list(names))}")
-    levels, of_images = next(iter(scored.values())).levels, scored.values()
-    result = Robustness(
-        names=list(scored),
-        clean=np.array([of.clean.score for of in of_images]),
-        scores={level: np.array([of.levels[level].score for of in of_images]) for level in levels},
-        values={level: np.array([of.levels[level].value for of in of_images]) for level in levels},
-        set_scores={},
-    )
-    return str(before["model"]), result
-
-
-def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that a run and its base share, in one form."""
-    levels = _levels(settings["scene"], settings["severity"])
-    scenes, severities = (sorted({level[i] for level in levels}) for i in range(2))
-    paths = {name: settings[name] and str(Path(settings[name]).expanduser().resolve()) for name in ("data", "depth")}
-    return paths | {"scene": scenes, "severity": severities} | {name: settings.get(name) for name in _SHARED}
-
-
-def _complete_lines(path: Path) -> list[str]:
-    """Return the lines of a file, without a part of one that a killed run left; none without a file."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
-    return [line for line in lines if line.endswith("\n")]
-
-
-def _parse_scores(line: str) -> tuple[str, Scored]:
-    row = json.loads(line)
-    of_levels = {Level(*level): ImageScore(*of) for *level, of in row["levels"]}
-    return row["name"], Scored(ImageScore(*row["clean"]), of_levels)
-
-
-@contextmanager
-def _stored_scores(
-    path: Path, settings: Mapping[str, Any]
-) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
-    """Yield the scores of an earlier run, and a function that stores those of a picture."""
-    lines = _complete_lines(path)
-    if lines:
-        before = json.loads(lines[0])
-        changed = [f"{name}={before.get(name)}" for name in settings if before.get(name) != settings[name]]
-        if changed:
-            raise UsageError(
-                f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
-            )
-    done = dict(map(_parse_scores, lines[1:]))
-    with replace_file(path, alone=True) as repaired:
-        repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
-    with path.open("a", encoding="utf-8") as stream:
-
-        def store(name: str, scored: Scored) -> None:
-            levels = [[*level, of] for level, of in scored.levels.items()]
-            stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
-            stream.flush()
-
-        yield done, store
 
 
 def _worst(result: Robustness, count: int) -> list[tuple[str, Level]]:

@@ -1,0 +1,109 @@
+"""The stored scores of a run of the command robustness, by which it continues, and beside which another is compared."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrefract import presets
+from torchrefract._io import replace_file
+from torchrefract._validation import UsageError, first_names
+from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
+from torchrefract.robustness.quantities import QUANTITIES
+
+SCORES = "scores.jsonl"  # one line of settings, then one for each picture
+FORMAT = 2  # of these lines; 1 had no summaries of predictions
+# Settings that a base shares, besides its data, scenes and severities.
+_SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
+
+
+@contextmanager
+def stored_scores(
+    path: Path, settings: Mapping[str, Any]
+) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
+    """Yield the scores of an earlier run, and a function that stores those of a picture."""
+    lines = _complete_lines(path)
+    if lines:
+        before = json.loads(lines[0])
+        changed = [f"{name}={before.get(name)}" for name in settings if before.get(name) != settings[name]]
+        if changed:
+            raise UsageError(
+                f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
+            )
+    done = dict(map(parse_scores, lines[1:]))
+    with replace_file(path, alone=True) as repaired:
+        repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
+    with path.open("a", encoding="utf-8") as stream:
+
+        def store(name: str, scored: Scored) -> None:
+            levels = [[*level, of] for level, of in scored.levels.items()]
+            stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
+            stream.flush()
+
+        yield done, store
+
+
+def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Robustness]:
+    """Return the model and the scores of an earlier run.
+
+    Raises:
+        UsageError: the folder has no run; its settings are others; it has none of the pictures.
+    """
+    lines = _complete_lines(path / SCORES)
+    if not lines:
+        raise UsageError(f"base must be a folder of an earlier run, got {path}, which has no {SCORES}")
+    before, scored = json.loads(lines[0]), dict(map(parse_scores, lines[1:]))
+    expected, of_base = _comparable(settings), _comparable(before)
+    changed = [f"{name}={of_base[name]}" for name in expected if of_base[name] != expected[name]]
+    if changed:
+        raise UsageError(
+            f"base must be a run on the same data with the same settings, got one with {', '.join(changed)}; score "
+            "that model again with the options of this run"
+        )
+    if scored.keys().isdisjoint(names):
+        raise UsageError(f"base must have scores of the same images, got none of {first_names(list(names))}")
+    levels, of_images = next(iter(scored.values())).levels, scored.values()
+    result = Robustness(
+        names=list(scored),
+        clean=np.array([of.clean.score for of in of_images]),
+        scores={level: np.array([of.levels[level].score for of in of_images]) for level in levels},
+        values={level: np.array([of.levels[level].value for of in of_images]) for level in levels},
+        set_scores={},
+    )
+    return str(before["model"]), result
+
+
+def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that a run and its base share, in one form."""
+    levels = levels_of(settings["scene"], settings["severity"])
+    scenes, severities = (sorted({level[i] for level in levels}) for i in range(2))
+    paths = {name: settings[name] and str(Path(settings[name]).expanduser().resolve()) for name in ("data", "depth")}
+    return paths | {"scene": scenes, "severity": severities} | {name: settings.get(name) for name in _SHARED}
+
+
+def _complete_lines(path: Path) -> list[str]:
+    """Return the lines of a file, without a part of one that a killed run left; none without a file."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
+    return [line for line in lines if line.endswith("\n")]
+
+
+def parse_scores(line: str) -> tuple[str, Scored]:
+    """Return the name and the scores of a picture, by its line."""
+    row = json.loads(line)
+    of_levels = {Level(*level): ImageScore(*of) for *level, of in row["levels"]}
+    return row["name"], Scored(ImageScore(*row["clean"]), of_levels)
+
+
+def levels_of(scenes: Any, severities: Any) -> list[Level]:
+    """Return the levels of options; raise UsageError for an unknown scene or severity."""
+    names = [scenes] if isinstance(scenes, str) else scenes or []
+    unknown = [name for name in names if name not in QUANTITIES]
+    if unknown or not names:
+        raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, got {', '.join(unknown) or 'none'}")
+    severities = [severities] if isinstance(severities, int | float) else severities
+    if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
+        raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
+    return [Level(name, int(severity)) for name in names for severity in severities]

@@ -20,8 +20,8 @@ over the draws. "rectified" rows are the same frames after `rectify` by the cali
 --drives degrades the frames of FRAMES/val by `cheap_dashcam`, as a validation of the task undistort does, and estimates
 the flow of each frame alone, by straight edges: the mean of the flows of 256 lenses that the effect draws, weighted by
 their likelihood. "constant" is their mean without weights. For "both" they are weighted also by a normal distribution
-around the flow of the network, of 20 px. --without leaves out frames whose own lens shows, by the beginnings of their
-names.
+around the flow of the network, of 20 px. --wide takes the wide lens of Table 1 instead. --without leaves out frames
+whose own lens shows, by the beginnings of their names.
 
 --clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
 frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
@@ -42,6 +42,7 @@ import cv2
 import numpy as np
 import torch
 from calibration import board_from_entry
+from table1 import wide_lens
 from timing import RESULTS, count, write_json
 from torch import Tensor
 
@@ -67,7 +68,6 @@ from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.data.video import convert_video, read_video, write_video
 from torchrefract.effects.base import Effect
-from torchrefract.effects.lens import LensDistortion
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.presets import cheap_dashcam
 from torchrefract.restoration.checkpoints import load_model
@@ -381,7 +381,7 @@ def main() -> None:
     elif arguments.clip:
         parser.error("--clip needs --checkpoint, such as lens_small")
     if arguments.drives:
-        effect = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1)) if arguments.wide else cheap_dashcam()
+        effect = wide_lens() if arguments.wide else cheap_dashcam()
         rows = held_out(arguments.drives, tuple(arguments.size), arguments.without, effect=effect, network=network)
         return write_json(arguments.out.with_name("held_out.json"), rows)
     if arguments.data:

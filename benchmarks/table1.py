@@ -151,14 +151,18 @@ def describe_commits(rows: Sequence[str], out: Path) -> str:
     return f"trained at commit {', '.join(sorted(commits)) or 'unknown'}, scored at {commit()}"
 
 
+def wide_lens() -> LensDistortion:
+    """Create the lens that no training draws."""
+    return LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
+
+
 def effects_of(task: str, width: int) -> dict[str, tuple[Effect, bool]]:
     """Return the scored effects of a task by name, each with True if it is in the paper's mix."""
     if task == "undistort":
         names = ("cheap_dashcam lens", "turbulence", "thin-plate spline", "divergence-free")
-        wide = LensDistortion(k1_range=(-0.4, 0.2), focal_range=(0.9, 1.1))
         bordered = {f"cheap_dashcam lens, {border} border": (cheap_dashcam(), False) for border in BORDERS}
         mix = _in_mix(paper_refractive(width=width, frame="fill"), names)
-        return mix | {"wide lens": (wide, False)} | bordered
+        return mix | {"wide lens": (wide_lens(), False)} | bordered
     return _in_mix(paper_weather(), ("uniform fog", "heterogeneous fog", "lens flare"))
 
 

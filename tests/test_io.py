@@ -40,7 +40,7 @@ def test_a_block_that_writes_nothing_raises(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("text", ["s3:/bucket/pairs", "gs:/a", "memory:/x", "file:/tmp/x", "S3:/a"])
+@pytest.mark.parametrize("text", ["s3:/bucket/pairs", "gs:/a", "memory:/x", "file:/a", "S3:/a"])
 def test_an_address_with_one_slash_raises_instead_of_naming_a_folder(text):
     with pytest.raises(ValueError, match=f"an address must have two slashes behind its scheme, got {text}; write "):
         as_path(text)

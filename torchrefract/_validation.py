@@ -90,6 +90,12 @@ def check_color(name: str, color: float | Sequence[float], *, high: float) -> tu
     return tuple(check_number(name, value, low=0.0, high=high) for value in values)
 
 
+def first_names(names: Sequence[str]) -> str:
+    """Join the first names and the number of the others, for a message."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
 def check_tensor(name: str, value: Tensor) -> Tensor:
     """Return `value` if it is a tensor."""
     if not isinstance(value, Tensor):
@@ -204,12 +210,6 @@ def _has_memory(value: Tensor) -> bool:
     except RuntimeError:
         return False
     return True
-
-
-def first_names(names: Sequence[str]) -> str:
-    """Join the first names and the number of the others, for a message."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
 
 
 def _check_real(name: str, value: float) -> float:

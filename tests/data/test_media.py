@@ -266,7 +266,9 @@ def test_a_video_of_high_dynamic_range_is_warned_of_once(tmp_path, transfer, nam
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == (name is not None)
     for message in messages:
-        assert re.search(rf"a\.mp4 has a high dynamic range \({name}\), .* Convert it first: ffmpeg .*tonemap", message)
+        assert re.search(
+            rf"a\.mp4 has a high dynamic range \({name}\), .* Convert it to BT.709 first, .*tonemap of ffmpeg", message
+        )
 
 
 # A thread of the parent that the child waits for does not exist in it.

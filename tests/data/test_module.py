@@ -245,8 +245,9 @@ def test_a_trainer_with_its_default_sampler_for_two_processes_validates_each_fra
     assert sorted(int(key) for part in parts for key in part) == list(range(4, 11))
 
 
-@pytest.mark.filterwarnings("ignore:.*no `validation_step`", "ignore:.*returned `None`", "ignore:.*overfit")
-@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")
+@pytest.mark.filterwarnings("ignore:.*no `validation_step`", "ignore:.*returned `None`")  # the module only notes keys
+@pytest.mark.filterwarnings("ignore:.*overfit", "ignore:.*does not have many workers")  # as the test asks for
+@pytest.mark.filterwarnings("ignore:.*LeafSpec")  # Lightning's own code
 def test_a_trainer_that_overfits_batches_gets_the_first_ones_in_each_epoch(tars):
     class Module(LightningModule):
         def __init__(self) -> None:

@@ -210,7 +210,7 @@ def test_a_plateau_halves_the_rate_after_more_than_five_epochs_without_a_lower_l
     assert rates == [1.0] * 7 + [0.5] * 7 + [0.25]
 
 
-@pytest.mark.filterwarnings("ignore:.*not available but strict is set to `False`")
+@pytest.mark.filterwarnings("ignore:.*not available but strict is set to `False`")  # every second epoch has no score
 def test_a_plateau_takes_a_validation_every_second_epoch(trainer, training, validation, loader):
     model, run = (
         Restoration(Constant, Undistort(), schedule="plateau"),

@@ -190,7 +190,7 @@ def ultralytics(tmp_path, monkeypatch) -> Any:
     return library
 
 
-@pytest.mark.filterwarnings("default")  # of the library
+@pytest.mark.filterwarnings("default")  # Ultralytics warns of its own code
 @pytest.mark.parametrize("size", [*SIZES, (700, 900)])
 @pytest.mark.parametrize("task", ["", "-seg"])
 def test_a_detector_of_ultralytics_predicts_as_for_a_file(ultralytics, tmp_path, size, task):
@@ -213,7 +213,7 @@ def test_a_detector_of_ultralytics_predicts_as_for_a_file(ultralytics, tmp_path,
     assert {path.name for path in tmp_path.iterdir()} == {"best.pt", "frame.png"}
 
 
-@pytest.mark.filterwarnings("default")  # of the library
+@pytest.mark.filterwarnings("default")  # Ultralytics warns of its own code
 def test_architectures_of_ultralytics_are_taken_and_other_tasks_and_files_refused(ultralytics, tmp_path):
     predictions = load_predictor("ultralytics:yolo11n.yaml")(torch.rand(2, 3, 40, 60))
     assert [set(prediction) for prediction in predictions] == [{"boxes", "labels", "scores"}] * 2

@@ -42,11 +42,7 @@ _NUM_SEEDS = 2**32  # NumPy's limit
 _MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
 _FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
 _WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
-_WRITING_ERRORS += (
-    errno.EEXIST,
-    errno.ENOTDIR,
-    errno.ENAMETOOLONG,
-)  # of a folder with the name of a file, and the like
+_WRITING_ERRORS += (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG)  # a file has the name of the folder, and the like
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
 _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is

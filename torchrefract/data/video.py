@@ -214,8 +214,7 @@ def _decode(path: Path) -> Iterator[av.VideoFrame]:
                         warnings.warn(
                             f"{path} has a high dynamic range ({_HDR[frame.color_trc]}), whose values are used like "
                             "those of an ordinary video: colors are pale, and light in fog and glare does not add up. "
-                            "Convert it first: ffmpeg -i INPUT -vf zscale=t=linear:npl=100,tonemap=hable,"
-                            "zscale=p=bt709:t=bt709:m=bt709,format=yuv420p OUTPUT",
+                            "Convert it to BT.709 first, such as by the filters zscale and tonemap of ffmpeg",
                             stacklevel=2,
                         )
                     if not is_interlaced and (is_interlaced := frame.interlaced_frame):

@@ -41,7 +41,7 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
-from torchrefract.fields.srgb import REC_709, color_per_channel
+from torchrefract.fields.srgb import color_per_channel
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
@@ -57,7 +57,7 @@ Airlight = float | Sequence[float] | _OfFrame | None
 
 _AIRLIGHTS = {"frame": airlight_of_frame, "dust": dust_airlight}
 _PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
-_GRAY = sum(weight * value for weight, value in zip(REC_709, _PAPER_AIRLIGHT, strict=True))
+(_GRAY,) = color_per_channel("airlight", _PAPER_AIRLIGHT, 1)
 MIN_TRANSMISSION = 1 / 255  # of what 8 bits can recover
 _ROUNDING = 2e-5  # relative, of a drawn extinction
 _ENDLESS = 1e30  # m, of a visibility that float32 hardly holds

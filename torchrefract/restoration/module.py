@@ -164,11 +164,8 @@ class RestorationModule(LightningModule, ABC):
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.lr, weight_decay=self.weight_decay)
         if self.schedule == "plateau":
             plateau = ReduceLROnPlateau(optimizer, factor=0.5, patience=5)
-            scheduler = {
-                "scheduler": plateau,
-                "monitor": "val/loss",
-                "strict": False,
-            }  # an epoch may have no validation
+            # Not strict, since an epoch may have no validation.
+            scheduler = {"scheduler": plateau, "monitor": "val/loss", "strict": False}
         else:
             steps = self.trainer.estimated_stepping_batches
             if math.isinf(steps):

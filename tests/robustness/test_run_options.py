@@ -169,6 +169,48 @@ def test_a_base_whose_pictures_had_other_draws_is_one_line_and_no_table(call, tm
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."] == ["scores.jsonl"]
 
 
+# --- versions
+
+
+def state_versions(out: Path, **versions: str) -> None:
+    """Replace the versions that a run has stored; without any, it is one that stored none."""
+    path = out / "scores.jsonl"
+    settings, *rows = path.read_text().splitlines(keepends=True)
+    settings = {name: of for name, of in json.loads(settings).items() if name != "versions"}
+    path.write_text(json.dumps(settings | ({"versions": versions} if versions else {})) + "\n" + "".join(rows))
+
+
+def test_a_run_of_another_version_is_not_continued_and_both_are_named(call, tmp_path, frames):
+    words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out")
+    assert call(*words).err == ""
+    state_versions(tmp_path / "out", torchrefract="0.1.9", torch=torch.__version__)
+    before = (tmp_path / "out" / "scores.jsonl").read_bytes()
+    assert call(*words).message == (
+        f"out must be a folder of a run of torchrefract {torchrefract.__version__}, got one of 0.1.9, whose draws may "
+        "differ; choose another, or continue with that version"
+    )
+    assert (tmp_path / "out" / "scores.jsonl").read_bytes() == before
+    state_versions(tmp_path / "out", torchrefract=torchrefract.__version__, torch="2.9.1")
+    assert call(*words).err == (
+        f"warning: out was begun with torch 2.9.1 and continues with {torch.__version__}: last digits may differ\n"
+    )
+    state_versions(tmp_path / "out")
+    assert call(*words).err == (
+        f"warning: out was begun by an unknown version of torchrefract and continues with {torchrefract.__version__}: "
+        "draws may differ\n"
+    )
+
+
+def test_a_base_of_another_version_is_said(call, tmp_path, frames):
+    assert call(*RUN, "scene=cheap_dashcam", "model=gray:shaken", "out=base").code == 0
+    state_versions(tmp_path / "base", torchrefract="0.1.9", torch=torch.__version__)
+    outcome = call(*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out", "base=base")
+    assert outcome.code == 0
+    assert (
+        f"warning: base was run with torchrefract 0.1.9, this is {torchrefract.__version__}: its pictures may differ\n"
+    ) in outcome.err
+
+
 # --- columns of the table
 
 

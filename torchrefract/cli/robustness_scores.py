@@ -1,13 +1,16 @@
 """The stored scores of a run of the command robustness, by which it continues, and beside which another is compared."""
 
 import json
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+import torchrefract
 from torchrefract import presets
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, first_names
@@ -16,6 +19,7 @@ from torchrefract.robustness.quantities import QUANTITIES
 
 SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 FORMAT = 2  # of these lines; 1 had no summaries of predictions
+_VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 # Settings that a base shares, besides its data, scenes and severities.
 _SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
 
@@ -33,9 +37,10 @@ def stored_scores(
             raise UsageError(
                 f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
             )
+        _check_versions(before.get("versions") or {})
     done = dict(map(parse_scores, lines[1:]))
     with replace_file(path, alone=True) as repaired:
-        repaired.write_text("".join(lines) or json.dumps(settings) + "\n", encoding="utf-8")
+        repaired.write_text("".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
@@ -47,7 +52,7 @@ def stored_scores(
 
 
 def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> tuple[str, Robustness]:
-    """Return the model and the scores of an earlier run.
+    """Return the model and the scores of an earlier run; warn if another version made them.
 
     Raises:
         UsageError: the folder has no run; its settings are others; it has none of the pictures.
@@ -65,6 +70,10 @@ def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> 
         )
     if scored.keys().isdisjoint(names):
         raise UsageError(f"base must have scores of the same images, got none of {first_names(list(names))}")
+    version = (before.get("versions") or {}).get("torchrefract", "of an unknown version")
+    if version != torchrefract.__version__:
+        text = f"torchrefract {version}, this is {torchrefract.__version__}: its pictures may differ"
+        print(f"warning: base was run with {text}", file=sys.stderr)
     levels, of_images = next(iter(scored.values())).levels, scored.values()
     result = Robustness(
         names=list(scored),
@@ -74,6 +83,22 @@ def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> 
         set_scores={},
     )
     return str(before["model"]), result
+
+
+def _check_versions(before: Mapping[str, str]) -> None:
+    """Raise UsageError if another version of torchrefract began a run; warn of an unknown one or another PyTorch."""
+    version = before.get("torchrefract")
+    if version is None:
+        text = f"an unknown version of torchrefract and continues with {torchrefract.__version__}: draws may differ"
+        print(f"warning: out was begun by {text}", file=sys.stderr)
+    elif version != torchrefract.__version__:
+        raise UsageError(
+            f"out must be a folder of a run of torchrefract {torchrefract.__version__}, got one of {version}, whose "
+            "draws may differ; choose another, or continue with that version"
+        )
+    elif before["torch"] != torch.__version__:
+        text = f"{before['torch']} and continues with {torch.__version__}: last digits may differ"
+        print(f"warning: out was begun with torch {text}", file=sys.stderr)
 
 
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:

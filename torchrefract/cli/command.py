@@ -105,9 +105,11 @@ def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
     """Quote file names for Hydra's grammar, and move options such as `-m` behind the overrides.
 
     Raises:
-        UsageError: if the arguments lack a task, or name several pictures.
+        UsageError: if the arguments lack a task, name several pictures, or give a folder of scenes to `robustness`.
     """
     is_multirun = any(argument in _MULTIRUN for argument in arguments)
+    if name == "robustness" and (given := {"--config-dir", "-cd"}.intersection(arguments)):
+        raise UsageError(f"scene must be given as a file, as in scene=[DIR/scene/mine.yaml], got {given.pop()}")
     if name == "preview":
         arguments = picture_as_option(name, arguments)
     if name == "eval":

@@ -19,11 +19,12 @@ from torch import Tensor, nn
 from torchvision import tv_tensors
 
 import torchrefract
-from torchrefract import presets, random
+from torchrefract import random
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive, first_names
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.robustness_scenes import describe_scenes, make_scenes
 from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_scores, read_base, stored_scores
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
@@ -42,7 +43,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
 from torchrefract.robustness.evaluate import Level, Robustness, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor, model_files
-from torchrefract.robustness.quantities import QUANTITIES
+from torchrefract.robustness.quantities import quantity_of
 from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
 from torchrefract.robustness.scores import (
     as_labels,
@@ -53,7 +54,7 @@ from torchrefract.robustness.scores import (
 )
 
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
-_WITH_WIDTH = ("highveld_heat_haze", "unpaved_road")  # scenes whose displacements are stated for a width
+_WIDTH = 1920  # px, of frames for which scenes are described; their quantities do not depend on it
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 _SETTINGS += ("camera", "horizon")
@@ -107,6 +108,7 @@ def test_robustness(cfg: DictConfig) -> None:
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
     settings |= {"worst_case_draws": num_draws, "format": FORMAT}
     levels = levels_of(settings["scene"], settings["severity"])
+    settings["effects"] = describe_scenes(levels)
     base = None if cfg.base is None else read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
@@ -114,16 +116,17 @@ def test_robustness(cfg: DictConfig) -> None:
     settings["files"] = file_digests([*model_files(str(cfg.model)), cfg.weights])
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
-    scenes = lru_cache(lambda width: _scenes(levels, width, folder.place))
+    scenes = lru_cache(lambda width: make_scenes(levels, width, folder.place))
+    quantities = {name: of for name, by in scenes(_WIDTH).items() if (of := quantity_of(by.values()))}
     if folder.depths is None:
-        warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(1920).values() for effect in by.values()))
+        warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(_WIDTH).values() for effect in by.values()))
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
-        options = {"as_target": as_labels, "quantities": QUANTITIES, "seed": seed, "done": done, "on_scored": store}
+        options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "done": done, "on_scored": store}
         options |= {"depth": folder.depth, "worst_case_draws": num_draws}
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
@@ -185,8 +188,13 @@ def _print_failures(result: Robustness) -> None:
 
 
 def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
-    for scene in result.quantities:
-        print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+    for scene in dict.fromkeys(level.scene for level in result.scores):
+        if scene in result.quantities:
+            print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+        else:
+            print(
+                f"{scene}: mean score {result.mean_performance(scene):.3f}; it has no quantity that could be tolerated"
+            )
         if num_draws:
             mean, worst = result.mean_performance(scene), result.mean_performance(scene, of="worst_case")
             print(f"{scene}: mean score {mean:.3f}, of the worst of {num_draws} draws {worst:.3f}")
@@ -249,14 +257,6 @@ def _check_shape(camera: Camera, name: str, image: Tensor) -> None:
         camera.resized(width=image.shape[2], height=image.shape[1])
     except ValueError as error:
         raise UsageError(f"camera must be that of all pictures, got {name}: {error}") from error
-
-
-def _scenes(levels: Iterable[Level], width: int, place: Mapping[str, Any]) -> dict[str, dict[int, Effect]]:
-    scenes: dict[str, dict[int, Effect]] = {}
-    for name, severity in levels:
-        options = {**place, "width": width} if name in _WITH_WIDTH else place
-        scenes.setdefault(name, {})[severity] = getattr(presets, name)(severity, **options)
-    return scenes
 
 
 def _folder(cfg: DictConfig) -> _Folder:

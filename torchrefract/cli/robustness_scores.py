@@ -21,7 +21,7 @@ SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 # Settings that a base shares, besides its data, scenes and severities.
-_SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "format")
+_SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "effects", "format")
 
 
 @contextmanager
@@ -123,12 +123,11 @@ def parse_scores(line: str) -> tuple[str, Scored]:
 
 
 def levels_of(scenes: Any, severities: Any) -> list[Level]:
-    """Return the levels of options; raise UsageError for an unknown scene or severity."""
+    """Return the levels of options; raise UsageError without a scene or for an unknown severity."""
     names = [scenes] if isinstance(scenes, str) else scenes or []
-    unknown = [name for name in names if name not in QUANTITIES]
-    if unknown or not names:
-        raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, got {', '.join(unknown) or 'none'}")
+    if not names:
+        raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, or scenes of yours, got none")
     severities = [severities] if isinstance(severities, int | float) else severities
     if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
         raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
-    return [Level(name, int(severity)) for name in names for severity in severities]
+    return [Level(str(name), int(severity)) for name in names for severity in severities]

@@ -13,7 +13,8 @@ Options:
     out=DIR                 output folder, required
     labels=PATH             COCO JSON, or a folder of YOLO files or of masks with the names of the pictures; its
                             classes must have the numbers of those of the model
-    scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ...
+    scene=[NAME,...]        cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, ..., or yours: a file
+                            .yaml, or package.module:function from a severity to an effect
     severity=[1,3,5]        1 to 5
     score=NAME              package.module:name of a function from a prediction and a target to a number in [0, 1]
     depth=DIR               depth maps of the pictures, as estimate_depth writes

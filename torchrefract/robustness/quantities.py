@@ -1,12 +1,70 @@
-"""The physical quantity by which each scene of `torchrefract.presets` is stated."""
+"""The physical quantity by which a scene is stated."""
 
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Any, cast
+
+from torch import Tensor
+
+from torchrefract.effects.base import Effect
+from torchrefract.effects.compose import Compose
+from torchrefract.effects.fog import UniformFog
+from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
+from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.physical_turbulence import PhysicalTurbulence
+from torchrefract.effects.road_mirage import RoadMirage
+from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.robustness.evaluate import Quantity
+from torchrefract.types import Range
 
+_VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
+_OF_EFFECTS: dict[type[Effect], Quantity] = {
+    UniformFog: _VISIBILITY,
+    HeterogeneousFog: _VISIBILITY,
+    SunGlare: Quantity("scattered sunlight", "%", True, lambda params: 100 * params.scatter),
+    RoadMirage: Quantity("road hotter than air", "K", True, lambda params: params.difference),
+    PhysicalTurbulence: Quantity("tilt", "microradians", True, lambda params: params.tilt),
+    LensDistortion: Quantity("k1", "", False, lambda params: params.coefficients[:, 0]),
+}
+
+
+def quantity_of(effects: Iterable[Effect]) -> Quantity | None:
+    """Return the quantity of a scene by its effects, one for each severity; a composition has that of its first part.
+
+    A lens has one if all its draws are barrel lenses, since the sign of k1 decides which values harm more. None if no
+    effect has one, if they differ, or if an effect is not always applied.
+    """
+    quantities = {_quantity(effect) for effect in effects}
+    return quantities.pop() if len(quantities) == 1 else None
+
+
+def _quantity(effect: Effect) -> Quantity | None:
+    if effect.p < 1:
+        return None
+    if type(effect) is Compose:
+        quantities = ((i, _quantity(child)) for i, child in enumerate(cast(Iterable[Effect], effect.effects)))
+        return next((_of_child(i, quantity) for i, quantity in quantities if quantity), None)
+    if isinstance(effect, LensDistortion) and (effect._source or max(cast(Range, effect.k1_range)) > 0):
+        return None
+    return _OF_EFFECTS.get(type(effect))
+
+
+@lru_cache
+def _of_child(index: int, quantity: Quantity) -> Quantity:
+    """Return the quantity of a composition that is that of a child."""
+
+    def get(params: Any) -> Tensor:
+        return quantity.get(params.children[index])
+
+    return quantity._replace(get=get)
+
+
+# Of torchrefract.presets.
 QUANTITIES = {
-    "cheap_dashcam": Quantity("k1", "", False, lambda params: params.coefficients[:, 0]),
-    "cape_town_fog": Quantity("visibility", "m", False, lambda params: params.visibility),
-    "limpopo_sun_glare": Quantity("scattered sunlight", "%", True, lambda params: 100 * params.scatter),
-    "highveld_heat_haze": Quantity("road hotter than air", "K", True, lambda params: params.children[0].difference),
-    "highveld_telephoto": Quantity("tilt", "microradians", True, lambda params: params.tilt),
-    "unpaved_road": Quantity("visibility", "m", False, lambda params: params.children[0].visibility),
+    "cheap_dashcam": _OF_EFFECTS[LensDistortion],
+    "cape_town_fog": _VISIBILITY,
+    "limpopo_sun_glare": _OF_EFFECTS[SunGlare],
+    "highveld_heat_haze": _of_child(0, _OF_EFFECTS[RoadMirage]),
+    "highveld_telephoto": _OF_EFFECTS[PhysicalTurbulence],
+    "unpaved_road": _of_child(0, _VISIBILITY),
 }

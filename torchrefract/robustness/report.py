@@ -226,7 +226,8 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
         text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
         value, _, interval = text.partition("[")
         cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
-    return cells
+    others = dict.fromkeys(level.scene for level in result.scores if level.scene not in result.quantities)
+    return cells + [(scene, "", "", "none, see the scores by severity") for scene in others]
 
 
 def _comparison(comparison: BaseComparison) -> list[str]:

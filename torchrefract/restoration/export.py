@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -97,9 +98,14 @@ def load_program(path: Path) -> Callable[[Tensor], list[Tensor]]:
             return [outputs] if isinstance(outputs, Tensor) else list(outputs)
 
         return run
-    session = _import("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    session = start_session(path)
     name = session.get_inputs()[0].name
     return lambda image: [torch.from_numpy(value) for value in session.run(None, {name: image.cpu().numpy()})]
+
+
+def start_session(path: Path) -> Any:
+    """Start a session of ONNX Runtime on the CPU; raise UsageError if it is not installed."""
+    return _import("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
 def _compare(path: Path, images: Tensor, expected: Sequence[Tensor]) -> dict[str, float]:

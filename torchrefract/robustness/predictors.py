@@ -3,7 +3,6 @@
 import importlib
 import os
 import sys
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,8 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from torchrefract.robustness.programs import load_program, naming_file
 
 _PROGRAMS = (".pt2", ".onnx", ".pt")
 _HOG_SCALE = 4.0  # a margin that counts as certain
@@ -39,8 +40,9 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
                 also of models that segment or find keypoints.
             "opencv:hog": the pedestrian detector of OpenCV (Dalal and Triggs 2005), which needs no weights; its scores
                 are the margins of its classifier, divided by 4.
-            a file: .pt2 of torch.export or .onnx, whose first output counts, or .pt of TorchScript: scores (1, K) or
-                (1, K, H, W), for images of the size that it takes.
+            a file: .pt2 of torch.export, .onnx, or .pt of TorchScript, for images of the size that it takes: a detector
+                with the outputs boxes, labels and scores, as those of torchvision, or scores (1, K) or (1, K, H, W) as
+                the first output.
         weights: for torchvision: a file of its state_dict, or None for the weights that torchvision downloads.
         device: of models in PyTorch.
 
@@ -59,7 +61,7 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
     elif kind == "ultralytics":
         predict = _load_ultralytics(os.path.expanduser(name), device)
     elif Path(model).suffix in _PROGRAMS:
-        predict = _load_program(Path(model), device)
+        predict = load_program(Path(model), device)
     elif model == "opencv:hog":
         predict = HogDetector()
     elif name:
@@ -114,40 +116,6 @@ def _as_bytes(images: Tensor) -> Tensor:
     return (255 * images).round().clamp(0, 255).byte()
 
 
-def _load_program(path: Path, device: str) -> Predict:
-    if not path.is_file():
-        raise ValueError(f"model must be a file that exists, got {path}")
-    if path.suffix == ".pt":
-        with _naming(f"model must be a TorchScript file of torch.jit.save, got {path}"):
-            _check_zip(path)
-            return torch.jit.load(path, map_location=device)
-    from torchrefract.restoration.export import load_program  # noqa: PLC0415 - imports the training stack
-
-    with _naming(f"model must be a program of torch.export or ONNX, got {path}"):
-        if path.suffix == ".pt2":
-            _check_zip(path)
-        program = load_program(path)
-    return lambda images: program(images)[0]
-
-
-def _check_zip(path: Path) -> None:
-    # PyTorch prints pages before it raises for other files.
-    if not zipfile.is_zipfile(path):
-        raise ValueError("it is no ZIP archive")
-
-
-@contextmanager
-def _naming(rule: str) -> Iterator[None]:
-    """Turn any error of a file that a library cannot load into ValueError."""
-    try:
-        yield
-    except ImportError:
-        raise
-    except Exception as error:  # PyTorch and ONNX Runtime raise errors of many types
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ValueError(f"{rule} ({reason})") from error
-
-
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
     from torchvision import models  # noqa: PLC0415 - an extra
 
@@ -162,7 +130,7 @@ def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
         network = models.get_model(name, weights=None, **parts)
         if not Path(weights).is_file():
             raise ValueError(f"weights must be a file that exists, got {weights}")
-        with _naming(f"weights must be a state_dict of {name}, got {weights}"):
+        with naming_file(f"weights must be a state_dict of {name}, got {weights}"):
             network.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     # A segmenter must keep the size of the images, in which the labels are.
     prepare = stored.transforms(resize_size=None) if kind == "segmentation" else stored.transforms()
@@ -179,7 +147,7 @@ def _load_transformers(name: str, device: str) -> Predict:
         "model must be one of the Hugging Face hub that can be reached, or a folder of one (download it elsewhere and "
         f"pass the folder), got {name}"
     )
-    with _naming(rule):
+    with naming_file(rule):
         config = transformers.AutoConfig.from_pretrained(name, **options)
     architecture = " ".join(config.architectures or [])
     task = next((task for task in _TASKS if task in architecture), None)
@@ -187,7 +155,7 @@ def _load_transformers(name: str, device: str) -> Predict:
         raise ValueError(
             f"model must be a detector, a semantic segmenter or a classifier, got {name} of {architecture or 'no kind'}"
         )
-    with _naming(rule):
+    with naming_file(rule):
         processor = transformers.AutoImageProcessor.from_pretrained(name, **options)
         network = getattr(transformers, f"AutoModelFor{task}").from_pretrained(name, **options)
     network.eval().to(device)
@@ -210,7 +178,7 @@ def _load_ultralytics(name: str, device: str) -> Predict:
     with _installed("ultralytics", "pip install ultralytics", name):
         from ultralytics import YOLO  # noqa: PLC0415 # pyright: ignore[reportMissingImports]  # in no extra
 
-    with _naming(f"model must be a file of YOLO (.pt) or the name of an architecture (.yaml), got {name}"):
+    with naming_file(f"model must be a file of YOLO (.pt) or the name of an architecture (.yaml), got {name}"):
         network = YOLO(name)
     if network.task not in _BOX_TASKS:
         raise ValueError(f"model must detect, segment or pose, got {name} of the task {network.task}")

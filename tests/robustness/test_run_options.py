@@ -1,5 +1,9 @@
+import base64
 import csv
+import io
 import json
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib import colormaps
+from PIL import Image
 
 import torchrefract
 from torchrefract import Camera, key_of, presets
@@ -313,3 +319,64 @@ def test_an_invalid_camera_or_horizon_is_one_line(call, tmp_path, frames, words,
     write_opencv(tmp_path / "large.yaml", replace(CAMERA, width=100, height=30, cx=49.5, cy=14.5))
     error = call(*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out", *words).message
     assert error.startswith(message)
+
+
+# --- batches and the device
+
+
+def test_batches_of_a_picture_give_the_scores_of_single_ones(call, tmp_path, frames):
+    (tmp_path / "batches.py").write_text(
+        "import torch, gray\nsizes = []\n\ndef pixels(images):\n    sizes.append(len(images))\n"
+        "    return gray.pixels(images)\n\ndef one(images):\n    return gray.pixels(images)[:1]\n"
+    )
+    words = ("robustness.__main__", "data=frames", "scene=[unpaved_road,cheap_dashcam]", "severity=[1,3,5]")
+    words += ("model=batches:pixels", "device=cpu", "limit=3")
+    for i, search in enumerate(((), ("worst_case=true", "worst_case_draws=2"))):
+        single, batch = f"out=single{i}", f"out=batch{i}"
+        assert call(*words, single, *search).code == 0
+        sys.modules["batches"].sizes.clear()
+        assert call(*words, batch, "batch_size=4", *search).code == 0
+        number = 6 if not search else 12  # of degraded versions
+        sizes = [1, *[4] * (number // 4), *[number % 4] * (number % 4 > 0)] * 3
+        assert sys.modules["batches"].sizes[: len(sizes)] == sizes
+        files = [tmp_path / out.removeprefix("out=") / "scores.jsonl" for out in (single, batch)]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    *_, message = call(*words[:4], "model=batches:one", "out=one", "batch_size=4").err.splitlines()
+    assert message == (
+        "error: predict must return a sequence of 4 predictions for as many images, got Tensor of 1; return a list, or "
+        "a tensor (4, ...); or set batch_size=1"
+    )
+    assert call(*words, "out=none", "batch_size=0").message.startswith("batch_size: batch_size must be at least 1")
+
+
+# --- the worst pictures of a segmenter
+
+
+def test_the_report_draws_the_classes_of_the_clean_and_the_degraded_picture_side_by_side(call, tmp_path, frames):
+    for path in frames.iterdir():
+        path.unlink()
+    clean = np.full((200, 400, 3), 40, np.uint8)
+    clean[:, 200:] = 140
+    clean[:, :100] = 250
+    cv2.imwrite(str(frames / "0.png"), clean)
+    words = ("robustness.__main__", "data=frames", "model=gray:pixels", "out=out", "severity=5", "worst=1")
+    assert call(*words, "scene=cape_town_fog").code == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    (figure,) = re.findall(r"<figure>(.*?)</figure>", page)
+    pictures = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(of)))) for of in re.findall(r"base64,([^\"]+)", figure)
+    ]
+    first, second = (255 * np.array(colormaps["tab20"](i)[:3]) for i in range(2))
+    effect = presets.cape_town_fog(5)
+    image = read_image(frames / "0.png")
+    degraded = effect.degrade(image, seed=0, keys=[key_of("0.png")]).image
+    for picture, plain in zip(pictures, (image, degraded), strict=True):
+        bright = (plain[0] > 0.7)[..., None].numpy()
+        expected = 127.5 * plain.movedim(0, -1).numpy() + 0.5 * np.where(bright, second, first)
+        assert picture.shape == expected.shape
+        assert np.median(abs(picture - expected)) < 3
+    assert not np.array_equal((image[0] > 0.7).numpy(), (degraded[0] > 0.7).numpy())
+    colors = ["rgb" + str(tuple(round(value) for value in color)) for color in (first, second)]
+    legend = " ".join(f'<span class="class" style="background: {of}"></span>{i}' for i, of in enumerate(colors))
+    assert legend in figure
+    assert "Colors are the predicted classes, for the clean image and for the degraded one." in page

@@ -44,7 +44,7 @@ from torchrefract.robustness.corruption_error import BaseComparison, compare_wit
 from torchrefract.robustness.evaluate import Level, Robustness, evaluate, move_target
 from torchrefract.robustness.predictors import Predict, import_function, load_predictor, model_files
 from torchrefract.robustness.quantities import quantity_of
-from torchrefract.robustness.report import Example, format_tolerated, write_report, write_tables
+from torchrefract.robustness.report import Classes, Example, format_tolerated, write_report, write_tables
 from torchrefract.robustness.scores import (
     as_labels,
     check_prediction,
@@ -69,6 +69,7 @@ class _Folder(NamedTuple):
     depths: DepthFolder | None
     skipped: list[str]  # why pictures cannot be read
     place: dict[str, Any]  # arguments of the scenes
+    device: torch.device  # of the images, and so of the effects
 
     @property
     def camera(self) -> Camera | None:
@@ -77,7 +78,10 @@ class _Folder(NamedTuple):
 
     def depth(self, name: str, image: Tensor) -> Tensor | None:
         """Return the depth map (1, H, W), m, of a picture; None without maps."""
-        return self.depths and self.depths.read(name, None, frame_size=(image.shape[1], image.shape[2]), size=None)
+        if self.depths is None:
+            return None
+        size = (image.shape[1], image.shape[2])
+        return self.depths.read(name, None, frame_size=size, size=None).to(self.device)
 
     def read(self, names: Iterable[str]) -> Iterator[tuple[str, Tensor, Any]]:
         """Yield name, image and target; a target of None stands for the prediction for the clean picture."""
@@ -92,7 +96,7 @@ class _Folder(NamedTuple):
                 _check_shape(self.camera, name, image)
             with naming("labels"):
                 target = None if self.labels is None else _target(self.labels.of(name), image)
-            yield name, image, target
+            yield name, image.to(self.device), target
 
 
 def test_robustness(cfg: DictConfig) -> None:
@@ -102,7 +106,7 @@ def test_robustness(cfg: DictConfig) -> None:
         loss = check_number("loss", cfg.loss, low=0.001, high=0.999)
     with naming("worst"):
         num_worst = check_count("worst", cfg.worst, low=0)
-    num_draws = _worst_case_draws(cfg)
+    num_draws, batch_size = _worst_case_draws(cfg), _batch_size(cfg)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     values["camera"] = folder.camera and json.loads(json.dumps(asdict(folder.camera)))  # as it is stored
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
@@ -111,7 +115,7 @@ def test_robustness(cfg: DictConfig) -> None:
     settings["effects"] = describe_scenes(levels)
     base = None if cfg.base is None else read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
-        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(find_device(str(cfg.device))))
+        predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(folder.device))
     # Ultralytics may have downloaded the file just now.
     settings["files"] = file_digests([*model_files(str(cfg.model)), cfg.weights])
     with naming("score"):
@@ -126,8 +130,8 @@ def test_robustness(cfg: DictConfig) -> None:
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))
-        options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "done": done, "on_scored": store}
-        options |= {"depth": folder.depth, "worst_case_draws": num_draws}
+        options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "depth": folder.depth, "done": done}
+        options |= {"on_scored": store, "worst_case_draws": num_draws, "batch_size": batch_size}
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
@@ -229,6 +233,11 @@ def _worst_case_draws(cfg: DictConfig) -> int | None:
     return num_draws if is_searched else None
 
 
+def _batch_size(cfg: DictConfig) -> int:
+    with naming("batch_size"):
+        return check_count("batch_size", cfg.batch_size)
+
+
 def _metric(cfg: DictConfig, path: Path) -> str:
     """Return the name of the score of a picture, by the first of the stored ones."""
     if cfg.score is None:
@@ -280,7 +289,7 @@ def _folder(cfg: DictConfig) -> _Folder:
         with naming("depth_scale"):
             depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths, [], _place(cfg))
+    return _Folder(path, names, labels, depths, [], _place(cfg), find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
@@ -345,11 +354,17 @@ def _example(
     _, image, target = next(folder.read([name]))
     effect = scenes(image.shape[2])[level.scene][level.severity]
     degraded = effect.degrade(image, seed=seed, keys=[random.key_of(name)], depth=folder.depth(name, image))
-    target = as_labels(predict(image[None].clone())[0], (image.shape[1], image.shape[2])) if target is None else target
+    predicted = predict(image[None].clone())[0]
+    size = (image.shape[1], image.shape[2])
+    target = as_labels(predicted, size) if target is None else target
     moved = move_target(target, degraded, effect)
     prediction = predict(degraded.image[None].clone())[0]
     caption = f"{name}, {level.scene} {level.severity}: {result.clean[i]:.2f} clean, {score:.2f} {degree}"
-    if not isinstance(prediction, dict):
-        return Example(degraded.image, caption, None, None)
-    boxes = prediction["boxes"][prediction["scores"] >= 0.5]
-    return Example(degraded.image, caption, moved["boxes"].as_subclass(Tensor), boxes.detach().cpu())
+    if isinstance(prediction, dict):
+        boxes = prediction["boxes"][prediction["scores"] >= 0.5]
+        return Example(degraded.image, caption, moved["boxes"].as_subclass(Tensor), boxes.detach().cpu())
+    if prediction.ndim == 1:
+        return Example(degraded.image, caption)
+    pictures = (image, predicted), (degraded.image, prediction)
+    clean, worst = (Classes(of, as_labels(classes, size).as_subclass(Tensor)) for of, classes in pictures)
+    return Example(degraded.image, caption, clean=clean, degraded=worst)

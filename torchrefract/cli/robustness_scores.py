@@ -30,6 +30,8 @@ def stored_scores(
 ) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
     """Yield the scores of an earlier run, and a function that stores those of a picture."""
     lines = _complete_lines(path)
+    if len(lines) == 1:
+        lines = []  # of a run that scored nothing
     if lines:
         before = json.loads(lines[0])
         changed = [f"{name}={before.get(name)}" for name in settings if before.get(name) != settings[name]]

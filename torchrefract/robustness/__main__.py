@@ -22,7 +22,8 @@ Options:
     base=DIR                output folder of an earlier run of another model, for the errors relative to it (mCE)
     loss=0.1                share of the clean score that is tolerated; weights=FILE for a model of torchvision
     worst_case=true         state also the worst of worst_case_draws=8 random draws, which takes 8 times as long
-    limit=N                 number of pictures; device=cuda, seed=0 of the draws
+    device=cuda             of the model and the effects; batch_size=8 versions of a picture that it predicts at once
+    limit=N                 number of pictures; seed=0 of the draws
 
 Examples:
     python -m torchrefract.robustness model=opencv:hog data=frames out=robustness scene=[cape_town_fog]

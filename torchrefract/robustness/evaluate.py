@@ -2,12 +2,15 @@
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torchrefract import random
 from torchrefract._tensor import sharing_results
@@ -197,6 +200,7 @@ def evaluate(
     done: Mapping[str, Scored] | None = None,
     on_scored: Callable[[str, Scored], None] | None = None,
     worst_case_draws: int | None = None,
+    batch_size: int = 1,
 ) -> Robustness:
     """Score a model on images as they are, and at each severity of each scene.
 
@@ -204,7 +208,7 @@ def evaluate(
     strength alone, so that differences between levels have small intervals.
 
     Args:
-        predict: from images (1, 3, H, W), float in [0, 1], to a sequence of one prediction.
+        predict: from images (B, 3, H, W), float in [0, 1], to a sequence of B predictions; B is 1 for clean images.
         samples: name, image (3, H, W) and target of each image. Labels of the target move along the flow.
         scenes: by name, and in each the effects by severity; or a function that returns them for a width in px.
         score: from a prediction and a target to a number in [0, 1], higher is better; see `robustness.scores`.
@@ -218,6 +222,7 @@ def evaluate(
         worst_case_draws: number of draws, at least 2, of which the worst for each image, scene and severity is kept: a
             random search of the parameters within the ranges of each effect. Draw i has the seed `seed + i`, draw 0
             gives all other scores. Takes as many calls of `predict` for each level; None does not search.
+        batch_size: largest number B of degraded versions of an image that `predict` takes at once.
 
     Returns:
         The scores of all images but those whose prediction raised.
@@ -226,10 +231,11 @@ def evaluate(
         RuntimeError: the prediction raised for more than a tenth of the images, from ten on, or for all of them.
         TypeError: a name that is no text; scenes that are not effects by scene and severity.
         ValueError: an image of another form; a name twice; a target of None without `as_target`; predictions that are
-            not a sequence of one; a score outside [0, 1]; `done` without the worst cases that are asked for.
+            not a sequence of B; a score outside [0, 1]; `done` without the worst cases that are asked for.
     """
     quantities, done = dict(quantities or {}), done or {}
     num_draws = 1 if worst_case_draws is None else check_count("worst_case_draws", worst_case_draws, low=2)
+    batch_size = check_count("batch_size", batch_size)
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
     for name, image, given in samples:
@@ -243,22 +249,20 @@ def evaluate(
             scenes(image.shape[-1]) if callable(scenes) and not isinstance(scenes, Effect) else scenes
         )
         try:
-            prediction = _predict(predict, image)
+            (prediction,) = _predict(predict, [image])
             target = given
             if given is None and as_target is not None:
                 target = as_target(prediction, (image.shape[-2], image.shape[-1]))
             clean = _score(score, prediction, target)
             draws: dict[Level, list[ImageScore]] = {}
             options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            for (scene, effects), i in itertools.product(by_name.items(), range(num_draws)):
-                quantity = quantities.get(scene)
-                with sharing_results():  # the severities of a scene have the same random fields
-                    for severity, effect in effects.items():
-                        degraded = effect.degrade(image, seed=seed + i, **options)
-                        prediction = _predict(predict, degraded.image)
+            with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
+                while batch := list(itertools.islice(pictures, batch_size)):
+                    predictions = _predict(predict, [of.degraded.image for of in batch])
+                    for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
+                        quantity = quantities.get(level.scene)
                         value = quantity.get(degraded.params).item() if quantity else 0.0
-                        moved = move_target(target, degraded, effect)
-                        draws.setdefault(Level(scene, severity), []).append(_score(score, prediction, moved, value))
+                        draws.setdefault(level, []).append(_score(score, prediction, moved, value))
             by_level = {level: _with_worst_case(of, seed) for level, of in draws.items()}
         except _PredictionError as error:
             failures[name] = str(error)
@@ -282,10 +286,12 @@ def evaluate(
 
 
 def move_target(target: Any, degraded: Degraded, effect: Effect) -> Any:
-    """Return the labels of a degraded image, or of a batch, moved along its flow; None stays None."""
+    """Return the labels of a degraded image, or of a batch, moved along its flow on their device; None stays None."""
     if target is None or not degraded.has("flow"):
         return target
-    return warp_moved_labels(target, degraded.flow.detach(), effect.labels_getter)
+    flow = degraded.flow.detach()
+    device = next((leaf.device for leaf in pytree.tree_leaves(target) if isinstance(leaf, Tensor)), flow.device)
+    return warp_moved_labels(target, flow.to(device), effect.labels_getter)
 
 
 def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
@@ -320,19 +326,39 @@ class _PredictionError(Exception):
     """A model that raised, with its reason."""
 
 
-def _predict(predict: Callable[[Tensor], Any], image: Tensor) -> Any:
-    """Return the prediction for an image (3, H, W), which the model may write to."""
+class _Picture(NamedTuple):
+    """A degraded image and its target."""
+
+    level: Level
+    degraded: Degraded
+    target: Any
+
+
+def _degraded(
+    image: Tensor, target: Any, scenes: Scenes, seeds: Iterable[int], options: dict[str, Any]
+) -> Generator[_Picture, None, None]:
+    """Yield an image at each level of each scene, once for each seed."""
+    for (scene, effects), seed in itertools.product(scenes.items(), seeds):
+        with sharing_results():  # the severities of a scene have the same random fields
+            for severity, effect in effects.items():
+                degraded = effect.degrade(image, seed=seed, **options)
+                yield _Picture(Level(scene, severity), degraded, move_target(target, degraded, effect))
+
+
+def _predict(predict: Callable[[Tensor], Any], images: Sequence[Tensor]) -> Any:
+    """Return the predictions for images (3, H, W), of which the model gets a copy that it may write to."""
     try:
-        predictions = predict(image[None].clone())
+        predictions = predict(torch.stack(list(images)))
     except Exception as error:  # a model may raise anything
         raise _PredictionError(f"{type(error).__name__}: {error}") from error
-    if isinstance(predictions, dict) or not hasattr(predictions, "__len__") or len(predictions) != 1:
+    if isinstance(predictions, dict) or not hasattr(predictions, "__len__") or len(predictions) != len(images):
         count = f" of {len(predictions)}" if isinstance(predictions, Tensor | list | tuple) else ""
+        one = "one prediction for one image" if len(images) == 1 else f"{len(images)} predictions for as many images"
         raise ValueError(
-            "predict must return a sequence of one prediction for one image, got "
-            f"{type(predictions).__name__}{count}; return a list, or a tensor (1, ...)"
+            f"predict must return a sequence of {one}, got {type(predictions).__name__}{count}; return a list, or a "
+            f"tensor ({len(images)}, ...)" + ("" if len(images) == 1 else "; or set batch_size=1")
         )
-    return predictions[0]
+    return predictions
 
 
 def _score(score: Callable[[Any, Any], float], prediction: Any, target: Any, value: float = 0.0) -> ImageScore:

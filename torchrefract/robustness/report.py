@@ -9,10 +9,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 from torch import Tensor
@@ -30,11 +30,20 @@ tr:nth-child(odd) td { background: #f3f3f3; } .wide { overflow-x: auto; }
 th { border-bottom: 1px solid #888; } td:first-child, th:first-child { text-align: left; }
 figure { display: inline-block; margin: .5rem; vertical-align: top; } img { max-width: 100%; }
 figcaption { font-size: 13px; max-width: 29rem; }
+.class { display: inline-block; width: .8em; height: .8em; margin: 0 .2em 0 .6em; }
 @media (max-width: 40rem) { td, th { padding: .25rem .4rem; font-size: 13px; } figure { margin: .5rem 0; } }
 """
 _OF_RUN = ("metric", "seed", "torchrefract", "torch")  # columns that are the same in all lines
 _SPACING = 0.08  # of the curves, severities
+_NUM_COLORS, _OPACITY, _SEEN_SHARE = 20, 0.5, 0.002  # of classes
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
+
+
+class Classes(NamedTuple):
+    """An image (3, H, W) and the class that is predicted at each pixel, (H, W), integers."""
+
+    image: Tensor
+    classes: Tensor
 
 
 @dataclass(frozen=True)
@@ -42,12 +51,15 @@ class Example:
     """A degraded image with its labels and predictions: boxes (n, 4) in px, or None.
 
     caption: name, level and scores.
+    clean, degraded: the predicted classes of the clean and of the degraded image, or None.
     """
 
     image: Tensor  # (3, H, W)
     caption: str
-    labels: Tensor | None
-    predictions: Tensor | None
+    labels: Tensor | None = None
+    predictions: Tensor | None = None
+    clean: Classes | None = None
+    degraded: Classes | None = None
 
 
 def write_tables(
@@ -145,6 +157,8 @@ def write_report(
         parts.append("<h2>The worst images</h2>")
         if any(example.labels is not None for example in examples):
             parts.append("<p>Labels (or predictions for the clean image) are green, predictions red.</p>")
+        if any(example.clean for example in examples):
+            parts.append("<p>Colors are the predicted classes, for the clean image and for the degraded one.</p>")
         parts += map(_figure, examples)
     page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
     page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -273,17 +287,60 @@ def _table(head: Sequence[str], rows: Any) -> str:
 
 
 def _figure(example: Example) -> str:
-    picture = Image.fromarray(to_uint8(example.image[None])[0].movedim(0, -1).cpu().numpy())
+    caption, legend = html.escape(example.caption), ""
+    if example.clean and example.degraded:
+        pictures = [_with_classes(of) for of in (example.clean, example.degraded)]
+        legend = _legend(example.clean.classes, example.degraded.classes)
+    else:
+        pictures = [_with_boxes(example)]
+    images = " ".join(f'<img alt="{caption}" src="data:image/jpeg;base64,{_jpeg(of)}">' for of in pictures)
+    return f"<figure>{images}<figcaption>{caption}{legend}</figcaption></figure>"
+
+
+def _with_boxes(example: Example) -> Image.Image:
+    picture = _picture(example.image)
     draw = ImageDraw.Draw(picture)
     for name, boxes in (("labels", example.labels), ("predictions", example.predictions)):
         for box in [] if boxes is None else boxes.tolist():
             draw.rectangle(box, outline=_COLORS[name], width=max(2, picture.width // 320))
+    return picture
+
+
+def _with_classes(prediction: Classes) -> Image.Image:
+    """Draw the classes of an image half-transparent over it."""
+    palette = np.array([_class_color(i) for i in range(_NUM_COLORS)], np.uint8)
+    colors = palette[prediction.classes.long().cpu().numpy() % _NUM_COLORS]
+    return Image.blend(_picture(prediction.image), Image.fromarray(colors), _OPACITY)
+
+
+def _legend(*predictions: Tensor) -> str:
+    """Return the color of each class that covers a share of a picture which can be seen."""
+    shares: dict[int, float] = {}
+    for classes in predictions:
+        for name, count in zip(*(of.tolist() for of in classes.long().unique(return_counts=True)), strict=True):
+            shares[name] = max(shares.get(name, 0.0), count / classes.numel())
+    parts = [
+        f'<span class="class" style="background: rgb{_class_color(name % _NUM_COLORS)}"></span>{name}'
+        for name, share in sorted(shares.items())
+        if share >= _SEEN_SHARE
+    ]
+    return f"<br>classes {' '.join(parts)}"
+
+
+def _class_color(index: int) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * value) for value in colormaps["tab20"](index)[:3])
+    return red, green, blue
+
+
+def _picture(image: Tensor) -> Image.Image:
+    return Image.fromarray(to_uint8(image[None])[0].movedim(0, -1).cpu().numpy())
+
+
+def _jpeg(picture: Image.Image) -> str:
     picture.thumbnail((460, 460))
     buffer = io.BytesIO()
     picture.save(buffer, format="JPEG", quality=85)
-    caption = html.escape(example.caption)
-    source = f"data:image/jpeg;base64,{_encoded(buffer.getvalue())}"
-    return f'<figure><img alt="{caption}" src="{source}"><figcaption>{caption}</figcaption></figure>'
+    return _encoded(buffer.getvalue())
 
 
 def _encoded(data: bytes) -> str:

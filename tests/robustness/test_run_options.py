@@ -366,7 +366,7 @@ def test_the_report_draws_the_classes_of_the_clean_and_the_degraded_picture_side
     pictures = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(of)))) for of in re.findall(r"base64,([^\"]+)", figure)
     ]
-    first, second = (255 * np.array(colormaps["tab20"](i)[:3]) for i in range(2))
+    first, second = (255 * np.array(colormaps["tab20"](i)[:3]) for i in (0, 2))
     effect = presets.cape_town_fog(5)
     image = read_image(frames / "0.png")
     degraded = effect.degrade(image, seed=0, keys=[key_of("0.png")]).image

@@ -328,7 +328,8 @@ def _legend(*predictions: Tensor) -> str:
 
 
 def _class_color(index: int) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * value) for value in colormaps["tab20"](index)[:3])
+    # Neighbors of this map are pairs of a dark and a light color.
+    red, green, blue = (round(255 * value) for value in colormaps["tab20"](2 * (index % 10) + index // 10)[:3])
     return red, green, blue
 
 

@@ -395,3 +395,33 @@ def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tm
     (tmp_path / "raw" / "11.png").unlink()
     message = call("degrade", *words, "out=more").message
     assert message.startswith("source must hold the picture after each that has an optical flow, got none after 10.png")
+
+
+def test_pictures_of_a_drive_are_one_clip_like_a_video(call, tmp_path):
+    names = ["one/2.png", "one/10.png", "one/11.png", "two/front/5.png"]  # 10 is after 2
+    for i, name in enumerate(names):
+        write(tmp_path / "raw" / name, picture(seed=i))
+    words = ("degrade", "source=raw", "scene=cape_town_fog", "severity=4", "workers=0", "seed=3")
+    assert call(*words, "out=out", "drive_by=folder").code == 0
+    effect = presets.cape_town_fog(4)
+    for drive, clip in (("one", names[:3]), ("two", names[3:])):
+        frames = [read_image(tmp_path / "raw" / name)[None].contiguous() for name in clip]
+        params = effect.sample(frames[0], seed=3, keys=[key_of(drive)])
+        for t, (name, frame) in enumerate(zip(clip, frames, strict=True)):
+            expected = effect.apply(frame, params, frame=t).image[0].movedim(0, -1).numpy()
+            result = np.asarray(cv2.imread(str(tmp_path / "out" / name)))[..., ::-1]
+            assert np.abs(result / 255 - expected).max() < 0.51 / 255 + 1e-5, name
+    complete = {name: (tmp_path / "out" / name).read_bytes() for name in names}
+    (tmp_path / "out" / names[1]).unlink()
+    assert call(*words, "out=out", "drive_by=folder").code == 0
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in names} == complete
+    # Another listing would move pictures to other times.
+    write(tmp_path / "raw" / "one" / "4.png", picture())
+    *_, error = call(*words, "out=out", "drive_by=folder").err.splitlines()
+    assert error.startswith("error: out must ")
+    assert "drives" in error
+    write(tmp_path / "raw" / "one" / "4.png", picture(width=64))
+    outcome = call(*words, "out=more", "drive_by=prefix")
+    assert "4.png: pictures of a drive must have the size of its first one, one/2.png, 96x48, got 64x48" in outcome.err
+    *_, error = call(*words, "out=none", "drive_by=car").err.splitlines()
+    assert error.startswith("error: drive_by: drive_by must be one of auto, folder, prefix")

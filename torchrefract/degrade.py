@@ -12,6 +12,7 @@ Options:
     labels=PATH             of the pictures: COCO JSON, folder of YOLO txt files, or folder of masks of the same names
     mask_fill=0             id of the pixels of a mask that show nothing of the clean picture
     maps=false              true writes flow, transmission and masks as PNG, as generate does; or npz, safetensors
+    drive_by=folder         draw the pictures of each drive once, as the frames of a video: auto, folder or prefix
     depth=DIR               folder of depth maps, as estimate_depth writes
     seed=0                  of the draws
     workers=N               processes, each of which degrades one file at a time; default: one for each core

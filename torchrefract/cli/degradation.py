@@ -1,6 +1,8 @@
 """The command that degrades pictures and videos, and moves the labels of pictures along."""
 
+import hashlib
 import json
+import re
 import sys
 import time
 import warnings
@@ -32,6 +34,7 @@ from torchrefract.cli.command import (
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
+from torchrefract.data.frames import drives_of
 from torchrefract.data.images import is_lost, pixels_of, read_image
 from torchrefract.data.label_files import (
     Annotation,
@@ -61,6 +64,14 @@ class _Task(NamedTuple):
     labels: PictureLabels | FlowFile | None
 
 
+class _Shot(NamedTuple):
+    """The place of a picture in the clip of its drive."""
+
+    drive: str
+    first: str  # name of its first picture
+    frame: int
+
+
 class _Result(NamedTuple):
     file: Path
     name: str
@@ -81,6 +92,8 @@ class Degrader(NamedTuple):
     maps: str | None  # their format
     out: Path
     is_alone: bool  # neither labels nor maps are written
+    root: Path  # of the source
+    shots: dict[str, _Shot] | None  # of pictures, by name; None draws each one
 
     def target(self, name: str) -> Path:
         """Return the path of a degraded file."""
@@ -114,8 +127,18 @@ class Degrader(NamedTuple):
     def _degraded(self, file: Path, name: str) -> Degraded:
         image = read_image(file)[None].contiguous()
         with _no_warnings():
-            options = {"seed": self.seed, "keys": [key_of(name)], "depth": self._depth(name, image)}
-            return self._effect(image).degrade(image, **options)
+            effect, depth = self._effect(image), self._depth(name, image)
+            if self.shots is None:
+                return effect.degrade(image, seed=self.seed, keys=[key_of(name)], depth=depth)
+            drive, first, frame = self.shots[name]
+            path = self.root / first
+            (height, width), params = _draw_drive(effect, drive, path, self.seed, path.stat().st_mtime_ns)
+            if image.shape[2:] != (height, width):
+                raise ValueError(
+                    f"pictures of a drive must have the size of its first one, {first}, {width}x{height}, got "
+                    f"{image.shape[3]}x{image.shape[2]}"
+                )
+            return effect.apply(image, params, frame=frame, depth=depth)
 
     def _moved(self, file: Path, labels: PictureLabels | FlowFile, degraded: Degraded) -> MovedLabels:
         if isinstance(labels, FlowFile):
@@ -160,6 +183,33 @@ def _make_effect(scene: str, width: int | None) -> Effect:
     return instantiate(json.loads(scene) | ({} if width is None else {"width": width}))
 
 
+@lru_cache(maxsize=16)
+def _draw_drive(effect: Effect, drive: str, first: Path, seed: int, time: int) -> tuple[tuple[int, int], Any]:
+    """Return the (height, width) of the first picture of a drive, and the parameters of its clip, drawn from it.
+
+    `time` is that of the last change of the file, for which the result is kept.
+    """
+    image = read_image(first)[None].contiguous()
+    return (image.shape[2], image.shape[3]), effect.sample(image, seed=seed, keys=[key_of(drive)])
+
+
+def _shots(cfg: DictConfig, pictures: Sequence[str]) -> dict[str, _Shot] | None:
+    """Number the pictures of each drive by the numbers in their names; None without drives."""
+    if cfg.drive_by is None:
+        return None
+    with naming("drive_by"):
+        drive_of = drives_of([*pictures], check_choice("drive_by", cfg.drive_by, ("auto", "folder", "prefix")))
+    clips: dict[str, list[str]] = {}
+    for name in sorted(pictures, key=_by_number):
+        clips.setdefault(drive_of[name], []).append(name)
+    return {name: _Shot(drive, clip[0], t) for drive, clip in clips.items() for t, name in enumerate(clip)}
+
+
+def _by_number(name: str) -> list[str | int]:
+    """Return the key that sorts 2.png before 10.png."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+
+
 def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replace_file(path, alone=True) as temporary:
@@ -183,11 +233,11 @@ def degrade(cfg: DictConfig) -> None:
     names = {file.relative_to(root).as_posix(): file for file in files}
     pictures = [name for name, file in names.items() if not media.is_video(file)]
     labels = _labels(cfg, pictures)
-    job = _job(cfg, out, pictures, labels)
+    job = _job(cfg, out, root, pictures, labels)
     with naming("workers"):
         workers = num_cores() if cfg.workers is None else check_count("workers", cfg.workers, low=0)
     with naming("out"):
-        claim(out, _settings(cfg, root, job, labels), count=0, about={}, earlier={"files": None})
+        claim(out, _settings(cfg, root, job, labels), count=0, about={}, earlier={"files": None, "drives": None})
     with locked("out", out):
         finished = {name for name, _ in _read_journal(out)}
         tasks = [
@@ -244,7 +294,7 @@ def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
     return labels
 
 
-def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
+def _job(cfg: DictConfig, out: Path, root: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
     effect = make(cfg, "scene")
@@ -270,7 +320,9 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | 
     is_given = any(word.lstrip("+").startswith("scene.width=") for word in HydraConfig.get().overrides.task)
     scene = json.dumps(OmegaConf.to_container(cfg.scene, resolve=True))
     has_width = "width" in cfg.scene and not is_given
-    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels))
+    return Degrader(
+        scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels), root, _shots(cfg, pictures)
+    )
 
 
 def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None) -> dict[str, Any]:
@@ -282,6 +334,7 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
         "files": file_digests(scene.values()),  # as that of a camera
         "width": "of each file" if job.has_width else None,
         "seed": job.seed,
+        "drives": job.shots and hashlib.sha256(repr(sorted(job.shots.items())).encode()).hexdigest(),
         "maps": job.maps,
         "depth": job.depth and [str(job.depth.root.resolve()), job.depth.scale],
         "labels": labels and labels.digest(),

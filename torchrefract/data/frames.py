@@ -147,7 +147,7 @@ def split_frames(
     if folders := _split_folders(root) if drive_by == "auto" else {}:
         frames = _assign_by_folder(root, paths, folders)
     else:
-        drive_of, val = _drives(paths, drive_by), set[str]()
+        drive_of, val = drives_of(paths, drive_by), set[str]()
         if split in ("train", "val") or (split is None and len(set(drive_of.values())) > 1):
             val = select_val_drives(root, drive_of, val_share=val_share, seed=seed)
         frames = [Source(path, drive, "val" if drive in val else "train") for path, drive in drive_of.items()]
@@ -247,7 +247,7 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     groups: dict[str, list[str]] = {"train": [], "val": [], "": []}
     for path in paths:
         groups[folders.get(path.split("/")[0], "")].append(path)
-    drives = {name: _drives(group, "auto", skip_levels=1 if name else 0) for name, group in groups.items()}
+    drives = {name: drives_of(group, "auto", skip_levels=1 if name else 0) for name, group in groups.items()}
     shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_UNNAMED})
     if shared:
         names = first_names(shared)
@@ -256,8 +256,8 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
-def _drives(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
-    """Return the drive of each path, without regard to its first folders."""
+def drives_of(paths: list[str], drive_by: str, *, skip_levels: int = 0) -> dict[str, str]:
+    """Return the drive of each path, without regard to its first `skip_levels` folders; see `FrameFolder`."""
     # Of the folders, which are few, so that paths of a drive share one text.
     folders = {
         folder: f"{folder}/".split("/")[skip_levels:-1] for folder in {path.rpartition("/")[0] for path in paths}

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SCRIPTS = sorted(EXAMPLES.glob("0*.py"))
-LIBRARIES = {"07_train_yolo.py": ("albumentations", "ultralytics")}  # that no extra of this package installs for tests
+SCRIPTS = sorted(EXAMPLES.glob("[0-9]*.py"))
+# That no extra of this package installs for tests.
+LIBRARIES = {"07_train_yolo.py": ("albumentations", "ultralytics"), "10_map_a_dataset.py": ("datasets",)}
 
 
 @pytest.mark.filterwarnings("default")  # of other libraries, which a script shows
@@ -34,3 +35,10 @@ def test_the_guide_links_every_example_and_only_existing_files():
     links = set(re.findall(r"\]\(([^)]+)\)", (EXAMPLES / "README.md").read_text()))
     assert {script.name for script in SCRIPTS} <= links
     assert all((EXAMPLES / link).is_file() for link in links)
+
+
+@pytest.mark.quick
+def test_the_example_of_datasets_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "datasets", None)
+    with pytest.raises(SystemExit, match="this example needs datasets: pip install datasets"):
+        runpy.run_path(str(EXAMPLES / "10_map_a_dataset.py"), run_name="__main__")

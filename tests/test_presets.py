@@ -12,6 +12,7 @@ import torch
 from torchrefract import (
     Compose,
     DivergenceFree,
+    GroundPlaneDepth,
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
@@ -54,6 +55,14 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "highveld_heat_haze": {"mirage": RARELY, **RARELY},
     "highveld_telephoto": RARELY,
     "unpaved_road": {"dust": RARELY, "haze": RARELY, "shutter": RARELY},
+}
+
+_PINHOLE = {"width": 640, "height": 360, "fx": 500.0, "fy": 510.0, "cx": 326.5, "cy": 179.5}
+PLACE: dict[str, Any] = {
+    "camera": Camera(**_PINHOLE, coefficients=(0.0,) * 4, model="opencv"),
+    "horizon": 0.4,
+    "depth": GroundPlaneDepth(),
+    "width": 640,
 }
 
 
@@ -187,8 +196,7 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
     def depth(image: torch.Tensor) -> torch.Tensor:
         return torch.full_like(image[:, :1], 50.0)
 
-    options = {"width": 640, "height": 360, "fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
-    camera = Camera(**options, coefficients=(0.0,) * 4, model="opencv")
+    camera = PLACE["camera"]
     scene = SCENES[name](camera=camera, horizon=0.4, depth=depth, width=640, **ARGUMENTS[name])
     for leaf in leaves(scene):
         assert leaf.p == 0.25
@@ -199,9 +207,18 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):
         SCENES[name](mistyped=1)
-    if name != "cheap_dashcam":
-        with pytest.raises(TypeError, match="camera must be a Camera, got int"):
-            SCENES[name](camera=1)
+
+
+@pytest.mark.quick
+def test_each_scene_takes_camera_horizon_depth_and_width_and_the_page_says_which_it_uses(scene):
+    lines = [line.split(maxsplit=1) for line in str(presets.__doc__).splitlines() if line.startswith("    ")]
+    used = {name for name in PLACE if name in dict(line for line in lines if len(line) == 2)[scene]}
+    assert used == {
+        name for name, value in PLACE.items() if repr(SCENES[scene](**{name: value})) != repr(SCENES[scene]())
+    }
+    assert repr(SCENES[scene](**PLACE)) != repr(SCENES[scene]())
+    with pytest.raises(TypeError, match="camera must be a Camera, got int"):
+        SCENES[scene](camera=1)
 
 
 @pytest.mark.quick

@@ -3,14 +3,26 @@
 `severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
 physical quantity, which each scene states, so that the score of a model can be plotted over it.
 
-All scenes but the paper's take the same keyword arguments, and ignore those that mean nothing for them:
+All scenes take the same keyword arguments about the frames, so that a loop over scenes can pass them to each:
 
     camera: of the frames, a `Camera` or a camera file; None is unknown, with a focal length of 0.9 widths.
     horizon: its position in the frame, 0 at the top edge and 1 at the bottom edge. Dashcams point slightly upward.
     depth: a depth provider or a function from images to their depth in m, for frames without a depth map. None is a
-        `CorridorDepth`, which warns that it is a guess.
+        `CorridorDepth`, which warns that it is a guess; for the paper's scenes it is the paper's.
     width: of the frames, px; displacements are stated for a width of 1920 px and scale with it.
-    arguments: of the effect of the scene, in place of their values here.
+
+A scene does not depend on all of them. The others change nothing:
+
+    cheap_dashcam       none, as it draws lenses of its own
+    cape_town_fog       camera, horizon, depth
+    limpopo_sun_glare   camera
+    highveld_heat_haze  camera, horizon, depth, width
+    highveld_telephoto  camera, horizon, depth
+    unpaved_road        camera, horizon, depth, width
+    paper_refractive    depth (of the turbulence), width
+    paper_weather       camera, depth (of the fogs)
+
+Scenes but the paper's also take the arguments of their effect, in place of their values here.
 """
 
 from collections.abc import Callable, Sequence
@@ -220,20 +232,32 @@ def unpaved_road(
     )
 
 
-def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, frame: str = "pad") -> OneOf:
+def paper_refractive(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+    frame: str = "pad",
+) -> OneOf:
     """Create the paper's four refractive distortions, one of them for each sample.
 
     Args:
         severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
+        camera, horizon: change nothing.
+        depth: of the turbulence, which then moves far things more than near ones; None moves all alike, as the paper.
         width: of the frames, px.
         frame: of the lens, see `LensDistortion`. The paper's has a black border; Table 1 fills the frames.
     """
+    _camera(camera)
     scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
             _cheap_lens(severity, frame=frame),
             Turbulence(
+                depth=depth,
                 amplitude_range=(0.5 * scale * px, 1.5 * scale * px),
                 length_range=(20.0 * px, 60.0 * px),
                 aperture_range=(3.0 * px, 5.0 * px),
@@ -244,18 +268,28 @@ def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, fram
     )
 
 
-def paper_weather(severity: int = 3) -> OneOf:
+def paper_weather(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+) -> OneOf:
     """Create the paper's three weather effects, one of them for each sample: uniform fog, heterogeneous fog or flare.
 
     Args:
         severity: 1 to 5, visibility of 300 m / severity, and light added at the sun of 0.2 severity +-0.05.
+        camera: of the frames, for the distance along the rays of the fogs; None is the depth alone, as in the paper.
+        horizon, width: change nothing.
+        depth: of the fogs; None is the ramp over the rows of the paper, `LinearDepth`.
     """
     visibility, strength = _at_severity(severity, [(300 / s, 0.2 * s) for s in SEVERITIES])
-    limits = (visibility, visibility)
+    fog: dict[str, Any] = {"visibility_range": (visibility, visibility), "camera": _camera(camera), "depth": depth}
     return OneOf(
         [
-            UniformFog(visibility_range=limits),
-            HeterogeneousFog(visibility_range=limits),
+            UniformFog(**fog),
+            HeterogeneousFog(**fog),
             LensFlare(strength_range=_around(strength, 0.05)),
         ]
     )
@@ -281,7 +315,8 @@ def _focal(camera: Camera | None) -> dict[str, float]:
 
 
 def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an effect, without those that all scenes take."""
+    """Return the arguments of an effect, without those that all scenes take; check the camera."""
+    _camera(arguments.get("camera"))
     return {name: value for name, value in arguments.items() if name not in ("camera", "horizon", "depth", "width")}
 
 

@@ -29,6 +29,7 @@ from torchrefract.cli.command import (
     progress,
     warn_of_assumed_depth,
 )
+from torchrefract.cli.place import place_scene
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
@@ -247,6 +248,7 @@ def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
 def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
+    place_scene(cfg)
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")

@@ -24,10 +24,19 @@ from torch import Tensor
 
 from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
+from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
-from torchrefract.data.images import UnreadableImageError, is_lost, pixels_of, read_image
+from torchrefract.cli.place import place_scene
+from torchrefract.data.images import (
+    UnreadableImageError,
+    check_frame_of_camera,
+    image_size,
+    is_lost,
+    pixels_of,
+    read_image,
+)
 from torchrefract.data.media import (
     check_output_folder,
     convert_video,
@@ -188,10 +197,17 @@ def export(cfg: DictConfig) -> None:
 def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, dict[str, Any] | None]:
     """Instantiate data, model and trainer, check that they fit together, and read the checkpoint at `ckpt_path`."""
     OmegaConf.resolve(cfg)
+    camera = _place_scene(cfg)
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     data, model = make(cfg, "data"), make(cfg, "model")
+    for frames in (data.train, data.val):
+        # A drive has one camera.
+        firsts = dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)) if camera else {}
+        for path in firsts.values():
+            height, width = image_size(path)
+            check_frame_of_camera(camera, str(path), height=height, width=width)
     try:
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
@@ -216,6 +232,16 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     if path and checkpoint:
         check_fits(checkpoint, model, path, config=cfg.model)
     return data, model, trainer, checkpoint
+
+
+def _place_scene(cfg: DictConfig) -> Camera | None:
+    """Give the scene the camera and the horizon of the options; return the camera of the frames in the files."""
+    if (cfg.camera is not None or cfg.horizon is not None) and not (cfg.data.get("root") and "effect" in cfg.data):
+        raise UsageError("camera and horizon must be those of frames in a folder, data=frames, got other data")
+    camera = place_scene(cfg, size=cfg.data.get("size"))
+    if "effect" in cfg.data:
+        cfg.data.effect = cfg.scene
+    return camera
 
 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:

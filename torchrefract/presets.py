@@ -48,6 +48,7 @@ from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import DepthProvider
+from torchrefract.labels.vehicles import VEHICLES
 from torchrefract.types import Range
 
 SEVERITIES = (1, 2, 3, 4, 5)
@@ -177,6 +178,7 @@ def unpaved_road(
     horizon: float = _HORIZON,
     depth: _DepthSource = None,
     width: float = _REFERENCE_WIDTH,
+    vehicle_labels: Sequence[int | str] | None = VEHICLES,
     dust: dict[str, Any] | None = None,
     haze: dict[str, Any] | None = None,
     shutter: dict[str, Any] | None = None,
@@ -188,6 +190,8 @@ def unpaved_road(
             displacement 200 m away of 0.3, 0.8, 1.5 px, each +-20 %; time to read out a frame of 15, 25, 40 ms, and
             vibration of the pitch of 0.05, 0.12, 0.2 degrees. The car drives at 40 to 80 km/h.
         camera, horizon, depth, width: as for all scenes.
+        vehicle_labels: names or numbers of the classes of vehicles, behind which the dust is thicker where the target
+            of an image, or the labels of `degrade`, have boxes. Boxes of torchvision have numbers: pass those of yours.
         dust: arguments of `HeterogeneousFog`.
         haze: arguments of `Turbulence`.
         shutter: arguments of `RollingShutter`.
@@ -214,6 +218,7 @@ def unpaved_road(
         "wind_z_range": (-0.5, -0.3),
         "decorrelation_range": (30.0, 60.0),
         "scale_height_range": (1.5, 4.0),
+        "vehicle_labels": vehicle_labels,
         "horizon": horizon,
     }
     of_shutter: dict[str, Any] = {

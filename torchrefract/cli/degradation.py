@@ -34,6 +34,7 @@ from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.images import is_lost, pixels_of, read_image
+from torchrefract.data.label_boxes import category_names, labeled_boxes
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -48,6 +49,7 @@ from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import claim, locked
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
+from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
@@ -82,6 +84,7 @@ class Degrader(NamedTuple):
     maps: str | None  # their format
     out: Path
     is_alone: bool  # neither labels nor maps are written
+    names: dict[int, str]  # of the categories of a COCO JSON
 
     def target(self, name: str) -> Path:
         """Return the path of a degraded file."""
@@ -99,7 +102,7 @@ class Degrader(NamedTuple):
             return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
 
     def _picture(self, task: _Task, path: Path) -> _Result:
-        degraded = self._degraded(task.file, task.name)
+        degraded = self._degraded(task.file, task.name, task.labels)
         result = _Result(task.file, task.name, num_frames=1)
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
@@ -112,17 +115,21 @@ class Degrader(NamedTuple):
         media.write_picture(degraded.image[0], path, source=task.file)
         return result
 
-    def _degraded(self, file: Path, name: str) -> Degraded:
+    def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()
+        draw, depth = {"seed": self.seed, "keys": [key_of(name)]}, self._depth(name, image)
         with _no_warnings():
-            options = {"seed": self.seed, "keys": [key_of(name)], "depth": self._depth(name, image)}
-            return self._effect(image).degrade(image, **options)
+            effect = self._effect(image)
+            if labels is None or isinstance(labels, FlowFile) or not uses_boxes(effect):
+                return effect.degrade(image, **draw, depth=depth)
+            boxes = labeled_boxes(labels, (image.shape[2], image.shape[3]), self.names)
+            return effect.apply(image, with_vehicles(effect, effect.sample(image, **draw), [boxes]), depth=depth)
 
     def _moved(self, file: Path, labels: PictureLabels | FlowFile, degraded: Degraded) -> MovedLabels:
         if isinstance(labels, FlowFile):
             following = degraded
             if degraded.has("flow"):
-                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following)
+                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following, None)
             with _no_warnings():
                 return MovedLabels(labels.move(degraded, following), 0)
         has_flow = degraded.has("flow") and bool(degraded.flow.any())
@@ -272,7 +279,8 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | 
     is_given = any(word.lstrip("+").startswith("scene.width=") for word in HydraConfig.get().overrides.task)
     scene = json.dumps(OmegaConf.to_container(cfg.scene, resolve=True))
     has_width = "width" in cfg.scene and not is_given
-    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels))
+    names = category_names(labels) if isinstance(labels, CocoLabels) else {}
+    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels), names)
 
 
 def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None) -> dict[str, Any]:

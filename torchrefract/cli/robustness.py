@@ -28,6 +28,7 @@ from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_frame_of_camera, read_image
+from torchrefract.data.label_boxes import boxes_of_coco, boxes_of_yolo
 from torchrefract.data.label_files import (
     CocoLabels,
     LabelFolder,
@@ -35,7 +36,6 @@ from torchrefract.data.label_files import (
     PictureLabels,
     YoloFile,
     read_labels,
-    yolo_rows,
 )
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
@@ -272,14 +272,7 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
             pixels = np.array(picture)
             return tv_tensors.Mask(pixels.astype(np.int32) if pixels.dtype == np.uint16 else pixels)
     if isinstance(labels, YoloFile):
-        scale = np.array([size[1], size[0]])
-        rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(content, labels.path)]
-        # The center and size of a box, or the corners of a polygon.
-        boxes = [
-            [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
-            for _, at in rows
-        ]
-        classes = [name for name, _ in rows]
+        boxes, classes = boxes_of_yolo(content, labels, size)
     else:
         annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
         for annotation in annotations:
@@ -288,11 +281,10 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
                     "labels must have a bbox and a category_id that is a whole number in each annotation, got "
                     f"{first_names([str(name) for name in annotation])} in annotation {annotation.get('id')}"
                 )
-        corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4))
-        boxes = np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1).tolist()
+        boxes = boxes_of_coco(annotations)
         classes = [annotation["category_id"] for annotation in annotations]
     options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
-    boxes = tv_tensors.BoundingBoxes(torch.tensor(boxes, dtype=torch.float32).view(-1, 4), **options)
+    boxes = tv_tensors.BoundingBoxes(torch.from_numpy(boxes).float(), **options)
     return {"boxes": boxes, "labels": torch.tensor(classes, dtype=torch.int64)}
 
 

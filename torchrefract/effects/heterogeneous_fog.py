@@ -126,8 +126,11 @@ class HeterogeneousFog(PhotometricEffect):
             and multiplies that of the random field; V is the visibility on the road. None is an even density.
         wake_density: of the dust on the road behind a vehicle ahead, relative to the mean extinction, at least 0.
         wake_length: m, over which this dust falls to 1/e toward the camera. It is as wide and high as the vehicle, see
-            `mean_wake_density`, and is added to the fog where boxes are given:
+            `mean_wake_density`, and is added to the fog where boxes are given: by `vehicle_labels`, or by
             `effect.apply(image, effect.sample(image)._replace(vehicles=boxes))`. Without boxes there is none.
+        vehicle_labels: numbers or names of the classes whose boxes raise this dust where a target has boxes, as in
+            `effect(image, target)` and `degrade labels=...`; boxes without classes all do, those of clips do not. None
+            raises none.
         camera_height, horizon: m, of the camera above the road, and share of the height of the frame, from the top, at
             which the road vanishes; for a plume and vehicles, and the horizon for the sun.
         sunlight_range: share of direct sunlight in the airlight, within [0, 1]: it makes the fog brighter on the side
@@ -181,6 +184,7 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height_range: Range | None = None,
         wake_density: float = 10.0,
         wake_length: float = 15.0,
+        vehicle_labels: Sequence[int | str] | None = None,
         camera_height: float = 1.3,
         horizon: float = 0.5,
         sunlight_range: Range | None = None,
@@ -220,6 +224,7 @@ class HeterogeneousFog(PhotometricEffect):
             self.scale_height_range = check_range("scale_height_range", scale_height_range, low=low, high=high)
         self.wake_density = check_number("wake_density", wake_density, low=0.0, high=1e6)
         self.wake_length = check_number("wake_length", wake_length, low=1e-3, high=1e6)
+        self.vehicle_labels = vehicle_labels if vehicle_labels is None else _check_labels(vehicle_labels)
         self.camera_height = check_positive("camera_height", camera_height)
         self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
         self.sunlight_range = (
@@ -404,6 +409,12 @@ class HeterogeneousFog(PhotometricEffect):
         return periods_in_frame(
             self.scales, unit=self.scale_unit, reference_width=self.reference_width, height=height, width=width
         )
+
+
+def _check_labels(labels: Sequence[int | str]) -> tuple[int | str, ...]:
+    if isinstance(labels, str) or not all(type(label) in (int, str) for label in labels):
+        raise ValueError(f"vehicle_labels must be numbers or names of classes, got {labels!r}")
+    return tuple(labels)
 
 
 def _check_scales(

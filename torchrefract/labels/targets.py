@@ -246,17 +246,17 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
     else:
-        corners = _convert(plain, boxes.format.name, "XYXY") - 0.5
+        corners = convert_boxes(plain, boxes.format.name, "XYXY") - 0.5
         limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
         warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
-        warped = _convert(warped + 0.5, "XYXY", boxes.format.name)
+        warped = convert_boxes(warped + 0.5, "XYXY", boxes.format.name)
     return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
 
 
 def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
-    corners = _convert(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
+    corners = convert_boxes(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
     outlines = warp_outlines(corners, flow[None], samples=_SAMPLES_PER_EDGE)
     axes = _box_axes(outlines.points, outlines.converged, corners)
     extent = outlines.extent(axes)
@@ -268,7 +268,7 @@ def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Option
     rectangle = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
     # The transpose of a rotation is its inverse: back from coordinates along the axes.
     warped = (rectangle[..., None] * axes[:, :, None]).sum(dim=-2)
-    return _convert(warped[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
+    return convert_boxes(warped[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
 
 
 def _box_axes(points: Tensor, converged: Tensor, corners: Tensor) -> Tensor:
@@ -377,7 +377,8 @@ def _clear_visibility(values: list[Any], leaves: list[Any], siblings: dict[str, 
         values[k] = after if kind is Tensor else after.numpy() if kind is np.ndarray else kind(after.tolist())
 
 
-def _convert(boxes: Tensor, old: str, new: str) -> Tensor:
+def convert_boxes(boxes: Tensor, old: str, new: str) -> Tensor:
+    """Convert boxes between two formats of torchvision, by their names."""
     convert = importlib.import_module("torchvision.transforms.v2.functional").convert_bounding_box_format
     return convert(boxes, old_format=old, new_format=new)
 

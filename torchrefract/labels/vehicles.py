@@ -38,10 +38,10 @@ def boxes_of_target(target: Any) -> LabeledBoxes:
         if not is_tv_tensor(leaf, "BoundingBoxes"):
             continue
         boxes.append(_corners(leaf))
-        beside = [(other, _classes(value)) for other, value in pairs if other[:-1] == path[:-1] and value is not leaf]
+        nearby = [(other, _classes(value)) for other, value in pairs if other[:-1] == path[:-1] and value is not leaf]
         if path and isinstance(path[-1], pytree.MappingKey):
-            beside = [(other, classes) for other, classes in beside if name_of(other).lower() in _CLASS_NAMES]
-        of_these = next((classes for _, classes in beside if classes is not None and len(classes) == len(leaf)), None)
+            nearby = [(other, classes) for other, classes in nearby if name_of(other).lower() in _CLASS_NAMES]
+        of_these = next((classes for _, classes in nearby if classes is not None and len(classes) == len(leaf)), None)
         is_labeled = is_labeled and (of_these is not None or len(leaf) == 0)
         labels += of_these or []
     all_boxes = torch.cat(boxes) if boxes else torch.zeros(0, 4, dtype=torch.float32, device="cpu")

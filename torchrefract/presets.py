@@ -15,6 +15,7 @@ A scene does not depend on all of them. The others change nothing:
 
     cheap_dashcam       none, as it draws lenses of its own
     cape_town_fog       camera, horizon, depth
+    night_fog           camera, horizon, depth
     limpopo_sun_glare   camera
     highveld_heat_haze  camera, horizon, depth, width
     highveld_telephoto  camera, horizon, depth
@@ -31,15 +32,17 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from torchrefract._validation import check_positive
+from torchrefract._validation import check_flag, check_positive
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree
+from torchrefract.effects.exposure import Exposure
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import UniformFog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.night_glow import NightGlow
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence
 from torchrefract.effects.road_mirage import RoadMirage
 from torchrefract.effects.rolling_shutter import RollingShutter
@@ -55,6 +58,11 @@ SEVERITIES = (1, 2, 3, 4, 5)
 
 _REFERENCE_WIDTH = 1920.0
 _HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
+_FOG_VISIBILITIES = [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)]  # m
+# Real fog by day has a mean of 0.17 to 0.2 of white in the pictures of dashcams.
+_FOG_EXPOSURE: dict[str, Any] = {"target_range": (0.16, 0.24), "gamma_range": (0.7, 1.0), "max_gain": 1.0}
+_NEAR_LAMP, _FAR_LAMP = 20.0, 40.0  # m, away from the camera; 3 d / V is their optical depth
+_LAMP_LUMINANCE = 20.0  # times white
 _LOW_SUN = (1.0, 0.94, 0.82)
 _TELEPHOTO_FOCAL = 4.0  # widths
 _T = TypeVar("_T")
@@ -79,18 +87,59 @@ def cape_town_fog(
     camera: _CameraSource = None,
     horizon: float = _HORIZON,
     depth: _DepthSource = None,
+    exposure: bool = False,
     **arguments: Any,
-) -> HeterogeneousFog:
+) -> HeterogeneousFog | Compose:
     """Create heterogeneous morning fog, through which the car drives at 50 to 70 km/h, at 30 frames per second.
 
-    Its color comes from the frame: that of the sky at the horizon, dark at night.
+    Its color comes from the frame: that of the sky at the horizon, dark at night. See `night_fog` for lamps in it.
 
     Args:
         severity: 1 to 5, visibility of 500 … 1000 m at 1, 60 … 200 m at 3, 20 … 40 m at 5.
         camera, horizon, depth: as for all scenes.
+        exposure: True for a camera that meters the foggy frame and darkens it, by `Exposure`: fog by day is gray in its
+            pictures, not white, and the road in it is dark. The scene is then a composition.
         arguments: of `HeterogeneousFog`, and those of all scenes.
     """
-    visibility = _at_severity(severity, [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)])
+    fog = _morning_fog(_at_severity(severity, _FOG_VISIBILITIES), camera, horizon, depth, arguments)
+    # A camera that has opened for the night does not open further.
+    return Compose([fog, Exposure(**_FOG_EXPOSURE)]) if check_flag("exposure", exposure) else fog
+
+
+def night_fog(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    glow: dict[str, Any] | None = None,
+    **arguments: Any,
+) -> Compose:
+    """Create the fog of `cape_town_fog` at night: dark, with lamps that shine through it in a glow.
+
+    Frames by day have the fog alone.
+
+    Args:
+        severity: 1 to 5, visibility as for `cape_town_fog`; the glow is that of lamps 20 to 40 m away.
+        camera, horizon, depth: as for all scenes.
+        glow: arguments of `NightGlow`.
+        arguments: of `HeterogeneousFog`, and those of all scenes.
+    """
+    low, high = visibility = _at_severity(severity, _FOG_VISIBILITIES)
+    lamps = {"linear_light": True, "lamp_luminance": _LAMP_LUMINANCE}
+    of_glow: dict[str, Any] = {
+        "optical_depth_range": (3 * _NEAR_LAMP / high, 3 * _FAR_LAMP / low),
+        "luminance_range": (0.2 * _LAMP_LUMINANCE, 0.6 * _LAMP_LUMINANCE),
+        "camera": _camera(camera),
+    }
+    fog = _morning_fog(visibility, camera, horizon, depth, lamps | arguments)
+    # The lamps that the fog leaves bright glow: fog after the glow would hide it.
+    return Compose([fog, NightGlow(**of_glow | dict(glow or {}))])
+
+
+def _morning_fog(
+    visibility: Range, camera: _CameraSource, horizon: float, depth: _DepthSource, arguments: dict[str, Any]
+) -> HeterogeneousFog:
     options: dict[str, Any] = {
         "mode": "ray",
         "visibility_range": visibility,
@@ -146,7 +195,7 @@ def highveld_heat_haze(
     options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon}
     options |= _focal(place["camera"]) | ({} if depth is None else {"depth": depth})
     haze = _turbulence(amplitude, width, **{"depth": place["depth"]} | arguments)
-    return Compose([RoadMirage(**options | (mirage or {})), haze])
+    return Compose([RoadMirage(**options | dict(mirage or {})), haze])
 
 
 def highveld_telephoto(
@@ -230,9 +279,9 @@ def unpaved_road(
     }
     return Compose(
         [
-            HeterogeneousFog(**of_dust | place | (dust or {})),
-            _turbulence(amplitude, width, **{"depth": place["depth"]} | (haze or {})),
-            RollingShutter(**of_shutter | place | (shutter or {})),
+            HeterogeneousFog(**of_dust | place | dict(dust or {})),
+            _turbulence(amplitude, width, **{"depth": place["depth"]} | dict(haze or {})),
+            RollingShutter(**of_shutter | place | dict(shutter or {})),
         ]
     )
 

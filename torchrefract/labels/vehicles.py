@@ -72,6 +72,15 @@ def select_vehicles(samples: Sequence[LabeledBoxes], labels: Collection[int | st
     return result
 
 
+def check_vehicle_labels(labels: Sequence[int | str] | None) -> tuple[int | str, ...] | None:
+    """Return numbers or names of classes as a tuple, or None; raise ValueError for other values."""
+    if labels is None:
+        return None
+    if isinstance(labels, str) or not all(type(label) in (int, str) for label in labels):
+        raise ValueError(f"vehicle_labels must be numbers or names of classes, got {labels!r}")
+    return tuple(labels)
+
+
 def _corners(boxes: Any) -> Tensor:
     """Return the smallest upright boxes, (N, 4), px from the center of the first pixel."""
     plain, form = boxes.as_subclass(Tensor), boxes.format.name

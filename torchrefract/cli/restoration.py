@@ -47,6 +47,7 @@ from torchrefract.restoration.checkpoints import (
     check_fits,
     how_to_continue,
     load_model,
+    load_weights,
     num_epochs_done,
     read_checkpoint,
 )
@@ -69,7 +70,9 @@ def train(cfg: DictConfig) -> None:
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
-    model.origin = _origin(cfg, data)
+    initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
+    licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)
+    model.origin = _origin(cfg, data, initial_licenses=licenses)
     _save_config(cfg, trainer)
     run = as_path(cfg.run_dir)
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
@@ -227,11 +230,13 @@ def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
                 OmegaConf.save(cfg, temporary)
 
 
-def _origin(cfg: DictConfig, data: PairData) -> dict[str, Any]:
+def _origin(cfg: DictConfig, data: PairData, *, initial_licenses: Any) -> dict[str, Any]:
     """Return what a checkpoint holds of its origin: configuration, training data, and licenses by source."""
     source, network = fingerprint(data.train), cfg.model.network
     weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
     licenses = {"data": source["license"], "pretrained weights": weights}
+    if cfg.init_from is not None:
+        licenses[f"initial weights, {cfg.init_from}"] = initial_licenses
     return {"config": OmegaConf.to_container(cfg, enum_to_str=True), "data": source, "licenses": licenses}
 
 

@@ -79,7 +79,7 @@ class FlowDiffusion(AveragedRestoration):
     ):
         if not isinstance(task, Undistort):
             raise TypeError(
-                "task must be Undistort for FlowDiffusion: add model=ddpm_image for the diffusion of an image, got "
+                "task must be Undistort for FlowDiffusion: add model=bridge for an image, got "
                 f"{type(task).__name__}"
             )
         num_coefficients = task.channels * NUM_TERMS

@@ -15,6 +15,7 @@ Options:
     trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length
     data.batch_size=16      frames in a step; data.workers=2 processes load them
     logger=csv              also write for tensorboard, or wandb (offline); both need the extra "loggers"
+    init_from=FILE          weights to start with: a checkpoint of the same model, or lens_small
     ckpt_path=FILE          last.ckpt of a stopped run, which is resumed
     hydra.run.dir=DIR       run folder; seed=0 sets weights, order and degradations
 

@@ -56,12 +56,14 @@ from torchrefract.restoration.checkpoints import (
     check_fits,
     how_to_continue,
     load_model,
+    load_weights,
     num_epochs_done,
     read_checkpoint,
 )
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.restoration.models.coordconv import weights_license
+from torchrefract.restoration.models.lens_net import LensEncoder
 from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, write_weights
 from torchrefract.restoration.tasks import Undistort
@@ -78,7 +80,9 @@ def train(cfg: DictConfig) -> None:
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
-    model.origin = _origin(cfg, data)
+    initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
+    licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)
+    model.origin = _origin(cfg, data, initial_licenses=licenses)
     _save_config(cfg, trainer)
     run = as_path(cfg.run_dir)
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
@@ -144,10 +148,8 @@ def restore(cfg: DictConfig) -> None:
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
     with locked("out", out):
-        if cfg.pool is not None:
-            predict = flow_predictor(job.restorer.model, job.restorer.size, job.device)
-            camera = estimate_camera(files, out / "camera.yaml", predict=predict, upright=True)
-            job = job._replace(restore_images=LensRestorer(camera, interpolation=job.restorer.interpolation))
+        if cfg.pool == "lens":
+            job = job.with_one_lens(files, out / "camera.yaml")
         _restore_missing(files, job, out)
 
 
@@ -253,11 +255,13 @@ def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
                 OmegaConf.save(cfg, temporary)
 
 
-def _origin(cfg: DictConfig, data: PairData) -> dict[str, Any]:
+def _origin(cfg: DictConfig, data: PairData, *, initial_licenses: Any) -> dict[str, Any]:
     """Return what a checkpoint holds of its origin: configuration, training data, and licenses by source."""
     source, network = fingerprint(data.train), cfg.model.network
     weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
     licenses = {"data": source["license"], "pretrained weights": weights}
+    if cfg.init_from is not None:
+        licenses[f"initial weights, {cfg.init_from}"] = initial_licenses
     return {"config": OmegaConf.to_container(cfg, enum_to_str=True), "data": source, "licenses": licenses}
 
 
@@ -266,6 +270,7 @@ class _Job(NamedTuple):
 
     restorer: Restorer
     restore_images: Callable[[Sequence[Tensor]], list[Tensor]]  # by the restorer, or by the lens of all frames
+    pools_videos: bool  # each video has one lens
     source: Path  # outputs are named by the path of a file relative to this folder
     out: Path
     batch: int
@@ -277,6 +282,12 @@ class _Job(NamedTuple):
 
     def is_done(self, file: Path) -> bool:
         return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
+
+    def with_one_lens(self, files: Sequence[Path], camera: Path) -> "_Job":
+        """Estimate one lens for files of one camera, write the camera, and return a job that restores by it."""
+        predict = flow_predictor(self.restorer.model, self.restorer.size, self.device)
+        lens = estimate_camera(files, camera, predict=predict, upright=True)
+        return self._replace(restore_images=LensRestorer(lens, interpolation=self.restorer.interpolation))
 
     def restore(self, images: Sequence[Tensor]) -> Iterator[Tensor]:
         """Restore images (3, H, W) in [0, 1]; `side_by_side` puts the image to the left of its restoration."""
@@ -299,12 +310,16 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         tile = None if sides is None else check_size("tile", sides)
     if tile is not None and loaded.task == Undistort.name:
         raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
-    if cfg.pool not in (None, "lens") or (cfg.pool and loaded.task != Undistort.name):
-        raise UsageError(f"pool must be null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}")
+    if cfg.pool not in (None, "auto", "lens") or (cfg.pool == "lens" and loaded.task != Undistort.name):
+        raise UsageError(
+            f"pool must be auto, null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}"
+        )
     with naming("interpolation"):
         options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
         restorer = Restorer(loaded.model.to(device), size=size, **options)
-    return _Job(restorer, restorer, source, out, batch, side_by_side, device)
+    # Other networks of this task find warps that change from frame to frame, too.
+    finds_lenses = any(isinstance(part, LensEncoder) for part in loaded.model.modules())
+    return _Job(restorer, restorer, cfg.pool == "auto" and finds_lenses, source, out, batch, side_by_side, device)
 
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
@@ -356,6 +371,8 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
     target = job.target(file)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
+        if job.pools_videos:
+            job = job.with_one_lens([file], target.with_suffix(".camera.yaml"))
         with replace_file(target, alone=True) as path:
             return convert_video(file, path, change=change)
     except UnreadableImageError as error:

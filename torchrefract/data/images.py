@@ -7,7 +7,6 @@ if it is complete: if it has the end marker of JPEG and PNG, or the length that 
 import io
 import os
 import stat
-import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from torchrefract._io import is_remote, read_bytes, retried
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract._validation import UsageError, check_size, check_tensor
+from torchrefract._validation import UsageError, check_size, check_tensor, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.jpeg import lacks_pixel_data
 
@@ -206,10 +205,9 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
 def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:
     """Warn of pictures and videos among the files of a folder whose format is not read."""
     if unread := [name for name in names if name.lower().endswith(_UNREAD)]:
-        warnings.warn(
+        warn(
             f"{source} holds {len(unread)} pictures or videos in formats that are not read, such as {unread[0]}; they "
-            "are left out: convert them to PNG or MP4",
-            stacklevel=3,
+            "are left out: convert them to PNG or MP4"
         )
 
 

@@ -7,7 +7,6 @@ import math
 import numbers
 import os
 import sys
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool
+from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool, warn
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.plain_values import check_moves, name_of
@@ -170,10 +169,9 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
         flags = cast(Tensor, warped[i].flags)
         for k in _rows_of_boxes(sample, paths, leaves, boxes, i, options.labels_getter):
             if options.labels_getter == "default" and _looks_like_camera_matrix(leaves[k]) and not flags.all():
-                warnings.warn(
+                warn(
                     f"target{pytree.keystr(paths[k])} has as many rows as there are boxes and lost those of removed "
-                    "boxes; if it is a matrix of the camera, say so in its name ('camera_...') or pass labels_getter",
-                    stacklevel=2,
+                    "boxes; if it is a matrix of the camera, say so in its name ('camera_...') or pass labels_getter"
                 )
             values[k] = _select(values[k], flags)
     return pytree.tree_unflatten(values, spec)

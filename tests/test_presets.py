@@ -161,7 +161,7 @@ def test_a_camera_that_meters_fog_by_day_darkens_it_and_leaves_the_night():
     white[:, :, 40:] = 0.3
     night[:, :, 20:24, 40:44] = 0.6
     for frame, is_darker in ((white, True), (night, False)):
-        scene = presets.cape_town_fog(5, depth=GroundPlaneDepth(), exposure=True)
+        scene: Any = presets.cape_town_fog(5, depth=GroundPlaneDepth(), exposure=True)
         params = scene.sample(frame, seed=1)
         foggy = scene.effects[0].apply(frame, params.children[0]).image
         exposed = scene.apply(frame, params).image

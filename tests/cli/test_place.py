@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,7 +38,7 @@ def folder(tmp_path) -> Path:
 
 
 def write_camera(path: Path, height: int, width: int) -> None:
-    pinhole = {"fx": 40.0, "fy": 42.0, "cx": width / 2 + 3, "cy": height / 2 - 2}
+    pinhole: dict[str, Any] = {"fx": 40.0, "fy": 42.0, "cx": width / 2 + 3, "cy": height / 2 - 2}
     write_opencv(path, Camera(width=width, height=height, **pinhole, coefficients=(0.0,) * 4))
 
 

@@ -86,6 +86,7 @@ def test_boxes_of_every_format_are_upright_boxes_from_the_center_of_the_first_pi
 def test_the_dust_of_the_gravel_road_is_raised_by_vehicles():
     assert presets.unpaved_road().effects[0].vehicle_labels == VEHICLES
     assert presets.unpaved_road(vehicle_labels=(2, 7)).effects[0].vehicle_labels == (2, 7)
-    for labels in ("car", [1.5], [True]):
+    wrong: list[Any] = ["car", [1.5], [True]]
+    for labels in wrong:
         with pytest.raises(ValueError, match="vehicle_labels must be numbers or names of classes, got"):
             HeterogeneousFog(vehicle_labels=labels)

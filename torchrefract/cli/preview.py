@@ -117,7 +117,7 @@ def _source(cfg: DictConfig) -> _Source:
     return _Source(resized, depth, name, note)
 
 
-def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, list[_MapName]]:
+def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_MapName]]:
     """Return the first frames of a folder or a video, or a picture that repeats, and names of their depth maps."""
     if path.is_dir():
         files = sorted(files_in(path), key=_natural_order)[:max_frames]

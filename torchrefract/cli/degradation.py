@@ -42,9 +42,10 @@ from torchrefract.data.label_files import (
     PictureLabels,
     read_labels,
 )
+from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import FORMATS, encode_maps
 from torchrefract.data.pairs.generator import maps_of
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
 from torchrefract.random import key_of

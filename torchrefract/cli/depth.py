@@ -16,7 +16,8 @@ from torchrefract.cli.command import find_device, make, naming, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 
 

@@ -35,6 +35,7 @@ from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.card import summarize, write_card
+from torchrefract.data.pairs.configuration import claim, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -48,12 +49,12 @@ from torchrefract.data.pairs.manifest import (
     LOST,
     Manifest,
     PairRow,
-    claim,
     find_manifests,
     locked,
     locked_shard,
     scan_rows,
 )
+from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
@@ -115,7 +116,10 @@ def generate(cfg: DictConfig) -> None:
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
             about = {"license": options.license, "made_with": _VERSIONS}
-            previous = claim(out, options.settings, count=options.num_pairs, about=about, earlier={"device": "cpu"})
+            suffix, num_pairs = shard_suffix(*options.shard), options.num_pairs
+            previous = claim(
+                out, options.settings, count=num_pairs, about=about, earlier={"device": "cpu"}, suffix=suffix
+            )
             options.write_list()
         if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
             print(f"existing pairs were made with {versions}, new ones are made with {_VERSIONS}: bytes may differ")
@@ -187,6 +191,8 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
     if engine["name"] == "ray" and workers == 0:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
+    if engine["name"] == "ray" and engine["address"]:
+        check_cluster(str(engine["address"]))
     with naming("source"):
         source = as_path(str(cfg.source))
     for name, path in (("out", out), ("source", source)):

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from torchrefract.data.pairs.manifest import locked_shard
@@ -91,6 +92,32 @@ def test_shards_of_another_seed_or_scene_without_their_options_are_an_error(call
         path.unlink()
     message = call("merge", "out=out0").message
     assert message.startswith("out must hold pairs of one configuration, got 6 of another seed or scene: 0, 2, 4 ")
+
+
+def test_the_table_of_pairs_has_a_row_for_each_pair_and_a_column_for_each_drawn_quantity(call, words, tmp_path, rows):
+    out = tmp_path / "out"
+    options = words("out", "shards=2", scene="cheap_dashcam")
+    for shard in (0, 1):
+        assert call("generate", *options, f"shard={shard}").code == 0
+    content = (out / "pairs.parquet").read_bytes()
+    (out / "pairs.parquet").unlink()
+    assert call("merge", "out=out").code == 0
+    assert (out / "pairs.parquet").read_bytes() == content
+    table = pq.read_table(out / "pairs.parquet").to_pylist()
+    manifest = rows(out)
+    for name in ("number", "key", "seed", "source", "frame", "drive", "split", "scene", "height", "width"):
+        assert [row[name] for row in table] == [row[name] for row in manifest]
+    for row, source in zip(table, manifest, strict=True):
+        assert (row["severity"], row["path"]) == (3, f"pairs/00000/{source['number']:08d}")
+        assert row["effects"] == [effect["effect"] for effect in source["effects"]]
+        drawn = {name: value for name, value in row.items() if "." in name and value is not None}
+        assert drawn == {
+            f"{effect['effect']}.{name}": value
+            for effect in source["effects"]
+            for name, value in effect.items()
+            if name != "effect"
+        }
+    assert len({row["LensDistortion.coefficients"][0] for row in table}) == 12
 
 
 def test_pairs_of_one_draw_are_an_error(call, words, tmp_path, rows):

@@ -49,7 +49,8 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (

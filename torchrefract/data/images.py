@@ -9,10 +9,10 @@ import os
 import stat
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchrefract._io import is_remote, read_bytes, retried
+from torchrefract._io import is_remote, local_file, read_bytes, retried, store_of
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import UsageError, check_size, check_tensor, warn
 from torchrefract.cameras.camera import Camera
@@ -159,7 +159,8 @@ def image_header(path: str | Path) -> ImageHeader:
         UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
             `read_image` alone.
     """
-    with opened(path) as stream:
+    # In a store, one request for the file is faster than several for its parts.
+    with io.BytesIO(read_file(path)) if is_remote(path) else opened(path) as stream:
         length = stream.seek(0, os.SEEK_END)
         stream.seek(0)
         _check_complete(path, stream, length)
@@ -175,7 +176,7 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
     if is_remote(path):
         store = cast(Path, path)
         try:
-            stream = cast(BinaryIO, retried(lambda: store.open("rb"), store))
+            stream = cast(BinaryIO, retried(lambda: store_of(store).open(cast(Any, store).path, "rb"), store))
         except OSError as error:
             raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
         with stream:
@@ -189,6 +190,17 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
     except OSError as error:
         raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+@contextmanager
+def local_copy(path: Path) -> Iterator[Path]:
+    """Yield a path on this machine with the content of a file, as `local_file` does; errors are those of `opened`."""
+    with ExitStack() as stack:
+        try:
+            copy = stack.enter_context(local_file(path))
+        except OSError as error:
+            raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+        yield copy
 
 
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:

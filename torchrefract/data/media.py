@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from torchrefract._io import is_remote
 from torchrefract._validation import UsageError, warn
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
@@ -86,7 +87,7 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
-    names = Counter(str(output_name(file)) for file in files)
+    names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
     return files
@@ -97,6 +98,8 @@ def check_output_folder(out: Path, source: Path, *, deep: bool = False, name: st
 
     `name` is the option of `source`.
     """
+    if is_remote(out) != is_remote(source):
+        return
     folder = (source if source.is_dir() else source.parent).resolve()
     if out.resolve() == folder:
         raise UsageError(f"out must be another folder than that of {name}, got {out}")
@@ -117,10 +120,10 @@ def output_name(file: Path) -> Path:
 def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
     """Return True if the output of a file exists and has its number of frames (video) or its sides (picture).
 
-    The output of a picture may hold several, side by side.
+    The output of a picture may hold several, side by side. A file of a store is not read for it.
     """
-    if not target.is_file():
-        return False
+    if not target.is_file() or is_remote(file):
+        return target.is_file()
     if is_video(file):
         # The header of a trimmed video counts frames that are not shown.
         return (num := video_info(target)[0]) > 0 and num in (video_info(file)[0], count_frames(file))

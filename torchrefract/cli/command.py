@@ -49,7 +49,7 @@ _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
 # a file or a function, that of other commands the choice of a group, without a dot.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|base|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|base|out|ckpt_path|init_from|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|model(?==.*[./])|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )

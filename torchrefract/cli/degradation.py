@@ -29,11 +29,13 @@ from torchrefract.cli.command import (
     progress,
     warn_of_assumed_depth,
 )
+from torchrefract.cli.place import place_scene
 from torchrefract.cli.stores import check_memory, disk_errors
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.images import is_lost, local_copy, pixels_of, read_image
+from torchrefract.data.label_boxes import category_names, labeled_boxes
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -49,6 +51,7 @@ from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
+from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
@@ -84,6 +87,7 @@ class Degrader(NamedTuple):
     maps: str | None  # their format
     out: Path
     is_alone: bool  # neither labels nor maps are written
+    names: dict[int, str]  # of the categories of a COCO JSON
 
     def target(self, name: str) -> Path:
         """Return the path of a degraded file."""
@@ -102,7 +106,7 @@ class Degrader(NamedTuple):
             return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
 
     def _picture(self, task: _Task, file: Path, path: Path) -> _Result:
-        degraded = self._degraded(file, task.name)
+        degraded = self._degraded(file, task.name, task.labels)
         result = _Result(task.file, task.name, num_frames=1)
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
@@ -115,17 +119,21 @@ class Degrader(NamedTuple):
         media.write_picture(degraded.image[0], path, source=file)
         return result
 
-    def _degraded(self, file: Path, name: str) -> Degraded:
+    def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()
+        draw, depth = {"seed": self.seed, "keys": [key_of(name)]}, self._depth(name, image)
         with _no_warnings():
-            options = {"seed": self.seed, "keys": [key_of(name)], "depth": self._depth(name, image)}
-            return self._effect(image).degrade(image, **options)
+            effect = self._effect(image)
+            if labels is None or isinstance(labels, FlowFile) or not uses_boxes(effect):
+                return effect.degrade(image, **draw, depth=depth)
+            boxes = labeled_boxes(labels, (image.shape[2], image.shape[3]), self.names)
+            return effect.apply(image, with_vehicles(effect, effect.sample(image, **draw), [boxes]), depth=depth)
 
     def _moved(self, file: Path, labels: PictureLabels | FlowFile, degraded: Degraded) -> MovedLabels:
         if isinstance(labels, FlowFile):
             following = degraded
             if degraded.has("flow"):
-                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following)
+                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following, None)
             with _no_warnings():
                 return MovedLabels(labels.move(degraded, following), 0)
         has_flow = degraded.has("flow") and bool(degraded.flow.any())
@@ -275,6 +283,7 @@ def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
 def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
+    place_scene(cfg)
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
@@ -300,7 +309,8 @@ def _job(cfg: DictConfig, out: Path, pictures: Sequence[str], labels: _Labels | 
     is_given = any(word.lstrip("+").startswith("scene.width=") for word in HydraConfig.get().overrides.task)
     scene = json.dumps(OmegaConf.to_container(cfg.scene, resolve=True))
     has_width = "width" in cfg.scene and not is_given
-    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels))
+    names = category_names(labels) if isinstance(labels, CocoLabels) else {}
+    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels), names)
 
 
 def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from torchrefract._validation import (
     first_names,
 )
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
+from torchrefract.cli.place import place_scene
 from torchrefract.cli.stores import check_memory, disk_errors
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source
@@ -168,6 +169,7 @@ def _is_repaired(row: PairRow, options: Options) -> bool:
 
 
 def _parse(cfg: DictConfig, out: Path) -> Options:
+    camera = place_scene(cfg, size=None if cfg.size is None else _checked(cfg, "size", check_size))
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
@@ -212,7 +214,7 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
-    reader = SourceReader(sources.root, plain["size"], depth)
+    reader = SourceReader(sources.root, plain["size"], depth, camera)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"], plain["device"])
     settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
     return Options(

@@ -8,7 +8,6 @@ import os
 import posixpath
 import re
 import stat
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ import torch
 from torch.utils.data import Dataset
 
 from torchrefract._io import as_path, is_remote, relative_name, sizes_in_store
-from torchrefract._validation import check_choice, check_number, check_size, first_names
+from torchrefract._validation import check_choice, check_number, check_size, first_names, warn
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image, warn_of_unread
 from torchrefract.random import key_of
@@ -267,7 +266,7 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     if shared:
         names = first_names(shared)
         message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
@@ -299,7 +298,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
             f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
             "train and val share drives; put each drive in a sub-folder of its own"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     val, missing = set(), val_share * len(drive_of)
     order = sorted(frames, key=lambda drive: key_of(f"{seed}/{drive}"))
     for drive in order:
@@ -323,7 +322,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
                 f"{examples}; remove them or copy them again"
             )
         message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:

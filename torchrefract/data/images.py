@@ -7,7 +7,6 @@ if it is complete: if it has the end marker of JPEG and PNG, or the length that 
 import io
 import os
 import stat
-import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -23,7 +22,8 @@ from torch import Tensor
 
 from torchrefract._io import is_remote, local_file, read_bytes, retried, store_of
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract._validation import check_size, check_tensor
+from torchrefract._validation import UsageError, check_size, check_tensor, warn
+from torchrefract.cameras.camera import Camera
 from torchrefract.data.jpeg import lacks_pixel_data
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
@@ -217,10 +217,9 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
 def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:
     """Warn of pictures and videos among the files of a folder whose format is not read."""
     if unread := [name for name in names if name.lower().endswith(_UNREAD)]:
-        warnings.warn(
+        warn(
             f"{source} holds {len(unread)} pictures or videos in formats that are not read, such as {unread[0]}; they "
-            "are left out: convert them to PNG or MP4",
-            stacklevel=3,
+            "are left out: convert them to PNG or MP4"
         )
 
 
@@ -271,9 +270,24 @@ def crop_center(maps: Tensor, size: Sequence[int]) -> Tensor:
     (height, width), (H, W) = size, maps.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
-    crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
-    top, left = (H - crop_height) // 2, (W - crop_width) // 2
+    top, left, crop_height, crop_width = center_crop((H, W), size)
     return maps[:, top : top + crop_height, left : left + crop_width]
+
+
+def check_frame_of_camera(camera: Camera | None, name: str, *, height: int, width: int) -> None:
+    """Raise UsageError if a frame of a file has another shape than the frames of the camera."""
+    try:
+        if camera is not None:
+            camera.resized(width=width, height=height)
+    except ValueError as error:
+        raise UsageError(f"camera must be that of all frames, got {name}: {error}") from error
+
+
+def center_crop(frame_size: Sequence[int], size: Sequence[int]) -> tuple[int, int, int, int]:
+    """Return (top, left, height, width), px, of the center of a frame (H, W) of the aspect ratio of `size` = (h, w)."""
+    (H, W), (height, width) = frame_size, size
+    crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
+    return (H - crop_height) // 2, (W - crop_width) // 2, crop_height, crop_width
 
 
 def reduce_by_area(maps: Tensor, size: Sequence[int]) -> Tensor:

@@ -5,7 +5,6 @@ display matrix) turns them for display. Readers take `upright`: True for the dis
 sensor. Writers keep the tag of a frame of the sensor, so that viewers show every output upright.
 """
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract._io import is_remote
-from torchrefract._validation import UsageError
+from torchrefract._validation import UsageError, warn
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
@@ -179,7 +178,7 @@ def write_picture(image: Tensor, path: Path, *, source: Path, upright: bool = Tr
     options = _ENCODING.get(suffix, [])
     is_encoded, encoded = cv2.imencodeWithMetadata(path.suffix, pixels, [*kept], [*kept.values()], options)
     if not is_encoded and kept.pop(cv2.IMAGE_METADATA_ICCP, None) is not None:
-        warnings.warn(f"{source} has an invalid color profile, which is not kept", stacklevel=2)
+        warn(f"{source} has an invalid color profile, which is not kept")
         is_encoded, encoded = cv2.imencodeWithMetadata(path.suffix, pixels, [*kept], [*kept.values()], options)
     if not is_encoded:
         raise UsageError(f"{path} could not be written as {path.suffix}")

@@ -37,7 +37,7 @@ Point = dict[str, float]  # the seconds and the scores of a validation, by name
 
 
 class Kind(NamedTuple):
-    """What a task is measured by."""
+    """The score of a task, and its models and rivals."""
 
     models: tuple[str, ...]  # the first three are the default
     score: str  # of a validation

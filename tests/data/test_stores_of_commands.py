@@ -194,5 +194,6 @@ def test_workers_of_a_loader_read_frames_and_pairs_from_s3(frames, tars, s3):
     folders = (FrameFolder(root, size=(16, 24)) for root in (frames, "s3://bucket/train"))
     pairs = (PairedFolder(root) for root in (tars, "s3://bucket/tars"))
     for disk, stored in (folders, pairs):
-        for sample, expected in zip(DataLoader(stored, batch_size=None, num_workers=1), disk, strict=True):
-            assert torch.equal(sample[0], expected[0])
+        samples = [sample[0] for sample in DataLoader(stored, batch_size=None, num_workers=1)]
+        assert len(samples) == len(disk)
+        assert all(torch.equal(samples[i], disk[i][0]) for i in range(len(disk)))

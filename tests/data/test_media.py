@@ -196,7 +196,7 @@ def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, 
         assert times_of(source) == pytest.approx([float(t * unit) for t in times], abs=1e-3)
     assert times_of(target) == pytest.approx(times_of(source), abs=1e-3)
     (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
-    # MKV rounds the start of compressed sound to 1 ms. FFmpeg's decoder ignores where MP4 ends it, so that the padding of
+    # MKV rounds the start of compressed sound to 1 ms. FFmpeg's decoder ignores where MP4 ends it, so the padding of
     # Opus follows the samples, but the file states the end.
     shift = next(k for k in range(-48, 49) if equal(new_samples[:, max(0, k) :], samples[:, max(0, -k) :]))
     assert shift == 0 or suffix == ".mkv"

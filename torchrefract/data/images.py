@@ -337,19 +337,14 @@ def _late_exif(head: bytes, stream: BinaryIO) -> bytes:
 def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
     mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
-
-    def decode(data: bytes) -> np.ndarray | None:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-
     try:
         with _silent_opencv():
-            pixels = decode(data)
-            is_partial = data.startswith(_JPEG) and pixels is not None and lacks_pixel_data(data, pixels, decode)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error as error:
         raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(f"{path} is damaged: its pixels cannot be decoded")
-    if is_partial:
+    if data.startswith(_JPEG) and lacks_pixel_data(data, pixels):
         raise UnreadableImageError(f"{path} is damaged: a part of its pixels is missing")
     return pixels
 

@@ -50,8 +50,13 @@ def check_image(image: Tensor) -> BatchShape:
 
     Raises:
         ValueError: another number of dimensions; no channel, no pixel or no frame.
-        TypeError: neither floating nor uint8.
+        TypeError: neither floating nor uint8; or `torch.jit.trace` runs.
     """
+    if torch.jit.is_tracing():
+        raise TypeError(
+            "image must be a tensor with values, got one of torch.jit.trace, which would repeat a single draw; use "
+            "torch.export.export or torch.compile"
+        )
     if is_foreign_image(image):
         raise TypeError(
             f"image must be a tensor, got {type(image).__module__}.{type(image).__name__}; convert it by "

@@ -122,6 +122,9 @@ def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(cal
     scored = call("eval", "ckpt_path=run/best.ckpt", "hydra.run.dir=again")
     assert scored.code == 0, scored.err
     assert "as in its own validation" in scored.out
+    write_camera(folder / "camera.yaml", 48, 64)
+    wider = ("trainer.max_epochs=2", "model.network.width=8", "ckpt_path=run/last.ckpt")
+    assert "got run/last.ckpt, where " in call("train", *options, *PLACE, *wider).message
     write_camera(folder / "camera.yaml", 32, 64)
     assert "camera must be that of all frames, got drives/v/a.png" in call("train", *options, *PLACE).message
     message = call("train", "+task=deweather", *PLACE).message

@@ -187,7 +187,7 @@ def test_a_training_on_frames_in_a_store_is_that_on_disk(call, memory, frames, s
 
 
 def test_workers_of_a_loader_read_frames_and_pairs_from_s3(frames, tars, s3):
-    """They are forked, and a client of S3 serves the process that made it."""
+    """Try forked workers, as a client of S3 serves only the process that made it."""
     store: Any = as_path("s3://bucket")
     store.fs.put(str(frames), "bucket/train", recursive=True)
     store.fs.put(str(tars), "bucket/tars", recursive=True)

@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -29,10 +29,10 @@ from rich.progress import track
 from torch import nn
 from yaml import YAMLError
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, as_path, is_remote
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
-from torchrefract.cli.stores import check_addresses
+from torchrefract.cli.stores import check_addresses, disk_errors
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.fields.corridor import CorridorDepth
@@ -228,6 +228,17 @@ def naming(part: str) -> Iterator[None]:
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
         raise UsageError(f"{part}: {error}") from error
+
+
+@contextmanager
+def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
+    """Yield the paths or addresses of the options `source` and `out`; errors of a store for `out` become one line."""
+    with naming("source"):
+        source = as_path(str(cfg.source))
+    with naming("out"):
+        out = as_path(str(cfg.out))
+    with disk_errors(out) if is_remote(out) else nullcontext():
+        yield source, out
 
 
 def warn_of_assumed_depth(effect: nn.Module) -> None:

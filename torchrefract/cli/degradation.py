@@ -27,10 +27,11 @@ from torchrefract.cli.command import (
     make,
     naming,
     progress,
+    source_and_out,
     warn_of_assumed_depth,
 )
 from torchrefract.cli.place import place_scene
-from torchrefract.cli.stores import check_memory, disk_errors
+from torchrefract.cli.stores import check_memory
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
@@ -188,14 +189,7 @@ def _no_warnings() -> Iterator[None]:
 
 def degrade(cfg: DictConfig) -> None:
     """Degrade the pictures and videos that are not in the output folder yet; print their number and the rate."""
-    with naming("source"):
-        source = as_path(str(cfg.source))
-    with naming("out"):
-        out = as_path(str(cfg.out))
-    if not is_remote(out):
-        _degrade(cfg, source, out)
-        return
-    with disk_errors(out):
+    with source_and_out(cfg) as (source, out):
         _degrade(cfg, source, out)
 
 

@@ -11,10 +11,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, make_folder, matching_files, relative_name
+from torchrefract._io import make_folder, matching_files, relative_name
 from torchrefract._validation import UsageError, check_count
-from torchrefract.cli.command import find_device, make, naming, progress
-from torchrefract.cli.stores import disk_errors
+from torchrefract.cli.command import find_device, make, naming, progress, source_and_out
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
@@ -31,14 +30,7 @@ class _Frame(NamedTuple):
 
 def estimate_depth(cfg: DictConfig) -> None:
     """Write the depth maps of a picture, a video or a folder that are not in the output folder yet."""
-    with naming("source"):
-        source = as_path(str(cfg.source))
-    with naming("out"):
-        out = as_path(str(cfg.out))
-    if not is_remote(out):
-        _estimate_depth(cfg, source, out)
-        return
-    with disk_errors(out):
+    with source_and_out(cfg) as (source, out):
         _estimate_depth(cfg, source, out)
 
 

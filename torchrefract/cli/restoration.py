@@ -29,6 +29,7 @@ from torchrefract.cli.command import check_none_lost, check_seed, find_device, m
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.cli.place import place_scene
+from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
     check_frame_of_camera,
@@ -205,12 +206,8 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     data, model = make(cfg, "data"), make(cfg, "model")
-    for frames in (data.train, data.val):
-        # A drive has one camera.
-        firsts = dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)) if camera else {}
-        for path in firsts.values():
-            height, width = image_size(path)
-            check_frame_of_camera(camera, str(path), height=height, width=width)
+    if camera is not None:
+        _check_camera(camera, data)
     try:
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
@@ -239,12 +236,22 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
 
 def _place_scene(cfg: DictConfig) -> Camera | None:
     """Give the scene the camera and the horizon of the options; return the camera of the frames in the files."""
-    if (cfg.camera is not None or cfg.horizon is not None) and not (cfg.data.get("root") and "effect" in cfg.data):
+    if cfg.camera is None and cfg.horizon is None:
+        return None
+    if not (cfg.data.get("root") and "effect" in cfg.data):
         raise UsageError("camera and horizon must be those of frames in a folder, data=frames, got other data")
     camera = place_scene(cfg, size=cfg.data.get("size"))
-    if "effect" in cfg.data:
-        cfg.data.effect = cfg.scene
+    cfg.data.effect = cfg.scene
     return camera
+
+
+def _check_camera(camera: Camera, data: PairData) -> None:
+    """Raise UsageError if the first frame of a drive, which has one camera, has another shape than the camera's."""
+    for frames in (data.train, data.val):
+        assert isinstance(frames, FrameFolder)  # as `_place_scene` checked
+        for frame in dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values():
+            height, width = image_size(frame)
+            check_frame_of_camera(camera, str(frame), height=height, width=width)
 
 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:

@@ -363,9 +363,10 @@ class HeterogeneousFog(PhotometricEffect):
         if params.sun is not None and self.sunlight_range is not None:
             lit = params._replace(airlight=finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0))
             airlight = expand_batch(self.airlight_map(lit, *image.shape[2:]), image.shape[0])
-        lit = image if self.lamp_luminance == 1 or plan.is_identity else self._unclip_lamps(image, params)
-        rendered = self.medium.blend(lit, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)
-        if lit is image:
+        has_lamps = self.lamp_luminance > 1 and not plan.is_identity
+        source = self._unclip_lamps(image, params) if has_lamps else image
+        rendered = self.medium.blend(source, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)
+        if not has_lamps:
             return rendered
         color = params.airlight.to(image.dtype)[:, :, None, None] if airlight is None else airlight
         brightest = torch.maximum(image, expand_batch(finite_or(color, 0.0), len(image)))

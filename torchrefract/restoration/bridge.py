@@ -21,8 +21,8 @@ class Bridge(AveragedRestoration):
         x_(t - 1/K) = x_t + network(x_t, t, degraded) / K,  from x_1 = degraded to x_0, in K steps
 
     A diffusion model must draw from noise what the degraded image shows already. The difference of clean and degraded
-    is the velocity of x_t, and a step of the sampler follows it. One step is a network without a diffusion; more steps
-    let it correct what it predicted. Nothing is drawn, so that an image has one restoration.
+    is the velocity of x_t, and a step of the sampler follows it. With one step it is a plain
+    network; with more, each corrects what the earlier ones predicted. Nothing is drawn: an image has one restoration.
 
     Args:
         network: builds the network from the number of channels, see `Denoiser`.
@@ -65,7 +65,7 @@ class Bridge(AveragedRestoration):
         """Restore images (B, 3, H, W) in [0, 1]. The key has no effect, because nothing is random."""
         image = degraded
         for step in range(self.steps):
-            point = torch.full((len(image),), 1 - step / self.steps, device=image.device)
+            point = torch.full((len(image),), 1 - step / self.steps, dtype=torch.float32, device=image.device)
             image = image + self._change(image, point, degraded) / self.steps
         return Restored(image)
 

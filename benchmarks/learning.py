@@ -1,9 +1,11 @@
-"""Train several networks on a lens for the same processor time, and plot their learning curves in one figure.
+"""Train several networks for the same processor time on a lens or in fog, and plot their learning curves in one figure.
 
-    python benchmarks/learning.py [--models ddpm resunet lens_net] [--seconds 240] [--size 192x336] [--scenes 512]
-                                  [--val 64] [--threads 1] [--out benchmarks/results/learning]
+    python benchmarks/learning.py [--task undistort] [--models ddpm resunet lens_net] [--seconds 240] [--size 192x336]
+                                  [--scenes 512] [--val 64] [--threads 1] [--out benchmarks/results/learning]
+    python benchmarks/learning.py --task deweather --size 96x168 [--models fog_net bridge ddpm_image]
 
-All networks see the same rendered roads, rendered before, through the same lenses. Four steps of each give the number
+All networks see the same rendered roads, rendered before, through the same lenses or the same fog. `ddpm_image` has the
+network of `bridge` here. Four steps of each give the number
 of steps that its seconds allow, at least six; the learning rate ends at zero there. Seconds are of the process, without
 validations. Models with results of the same settings in `--out` are not trained again.
 """
@@ -13,7 +15,7 @@ import json
 import time
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -27,17 +29,43 @@ from torchrefract.data.module import PairData
 from torchrefract.restoration.report import save_figure
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-MODELS = ("ddpm", "resunet", "lens_net", "segformer")
+_SMALL = ("model.network.widths=[32,64,128,128]", "model.lr=0.001", "model.warmup_steps=50", "model.crop=null")
+_OPTIONS = {"ddpm_image": _SMALL}  # of models that are too large for minutes
 _TRIAL, _POINTS = 4, 6  # steps, validations
 _BATCH = 16  # frames
 Point = dict[str, float]  # the seconds and the scores of a validation, by name
 
 
+class Kind(NamedTuple):
+    """The score of a task, and its models and rivals."""
+
+    models: tuple[str, ...]  # the first three are the default
+    score: str  # of a validation
+    unit: str
+    rivals: dict[str, str]  # names of methods without a network, by the suffix of their score
+
+
+KINDS = {
+    "undistort": Kind(
+        ("ddpm", "resunet", "lens_net", "segformer"),
+        "epe",
+        "endpoint error (px at 1920x1080)",
+        {"identity": "do nothing", "constant": "best constant flow"},
+    ),
+    "deweather": Kind(
+        ("fog_net", "bridge", "ddpm_image", "resunet"),
+        "psnr",
+        "PSNR (dB)",
+        {"identity": "do nothing", "fog": "true fog, 8 bits"},
+    ),
+}
+
+
 class Clock(Callback):
     """Measure the processor time of training steps, and keep and print the scores of each validation."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, kind: Kind) -> None:
+        self.name, self.kind = name, kind
         self.steps: list[float] = []
         self.points: list[Point] = []
 
@@ -57,16 +85,19 @@ class Clock(Callback):
         """Add a point, and do not count the time of the validation."""
         scores = {name: float(value) for name, value in trainer.callback_metrics.items() if name.startswith("val/")}
         self.points.append({"seconds": sum(self.steps), "steps": len(self.steps)} | scores)
-        print(f"{self.name}: {sum(self.steps):.0f} s, {len(self.steps)} steps, {scores['val/epe']:.2f} px", flush=True)
+        score = f"{self.kind.unit} {scores[f'val/{self.kind.score}']:.2f}"
+        print(f"{self.name}: {sum(self.steps):.0f} s, {len(self.steps)} steps, {score}", flush=True)
         self._last = time.process_time()
 
 
 def main() -> None:
     """Train the models that have no results yet, print a table, and plot the curves."""
     args = _parser().parse_args()
+    kind = KINDS[args.task]
+    args.models = args.models or kind.models[:3]
     torch.set_num_threads(args.threads)
     height, width = args.size
-    settings = f"{height}x{width}_{args.scenes}_{args.val}_{args.seconds:g}s"
+    settings = f"{args.task}_{height}x{width}_{args.scenes}_{args.val}_{args.seconds:g}s"
     files = {name: args.out / f"{name}_{settings}.json" for name in args.models}
     if missing := [name for name, file in files.items() if not file.is_file()]:
         data = instantiate(_config(missing[0], args).data)
@@ -76,15 +107,16 @@ def main() -> None:
         for name in missing:
             write_json(files[name], learn(name, data, args))
     curves = {name: json.loads(file.read_text()) for name, file in files.items()}
-    print(table(curves))
-    save_figure(plot(curves), args.out / "curves.png")
+    print(table(curves, kind))
+    save_figure(plot(curves, kind), args.out / f"{args.task}.png")
 
 
 def learn(name: str, data: PairData, args: argparse.Namespace) -> list[Point]:
     """Train a model for the seconds of the arguments; return its validations."""
-    _fit(name, data, args, trial := Clock(name), steps=_TRIAL, interval=None)
+    kind = KINDS[args.task]
+    _fit(name, data, args, trial := Clock(name, kind), steps=_TRIAL, interval=None)
     interval = max(1, round(args.seconds / median(trial.steps) / _POINTS))
-    _fit(name, data, args, clock := Clock(name), steps=_POINTS * interval, interval=interval)
+    _fit(name, data, args, clock := Clock(name, kind), steps=_POINTS * interval, interval=interval)
     return clock.points
 
 
@@ -102,38 +134,45 @@ def _fit(
 
 def _config(name: str, args: argparse.Namespace) -> Any:
     """Return the configuration of `torchrefract.train` for a model, with the frames of this process."""
-    words = ["+task=undistort", f"model={name}", f"frame_size=[{args.size[0]},{args.size[1]}]"]
+    words = [
+        f"+task={args.task}",
+        f"model={name}",
+        *_OPTIONS.get(name, ()),
+        f"frame_size=[{args.size[0]},{args.size[1]}]",
+    ]
     words += ["data.workers=0", f"data.batch_size={_BATCH}"]
-    words += [f"train_scenes={args.scenes}", f"data.val_count={args.val}"]
+    words += [f"data.train_count={args.scenes}", f"data.val_count={args.val}"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("train", words)
     OmegaConf.resolve(parts := OmegaConf.create({"task": config.task, "seed": config.seed}))
     return OmegaConf.merge(config, parts)
 
 
-def table(curves: dict[str, list[Point]]) -> str:
+def table(curves: dict[str, list[Point]], kind: Kind) -> str:
     """Format a Markdown table of the last validation of each model."""
-    head = ["model", "seconds", "steps", "endpoint error (px at 1920x1080)", "do nothing", "best constant flow"]
-    rows = [[*head, "within two standard deviations"], ["---"] * (len(head) + 1)]
+    head = ["model", "seconds", "steps", kind.unit, *kind.rivals.values(), "within two standard deviations"]
+    rows = [head, ["---"] * len(head)]
     for name, points in curves.items():
         last = points[-1]
-        cells = [name, f"{last['seconds']:.0f}", f"{last['steps']:.0f}", f"{last['val/epe']:.2f}"]
-        cells += [f"{last[f'val/epe_{rival}']:.2f}" for rival in ("identity", "constant")]
+        cells = [name, f"{last['seconds']:.0f}", f"{last['steps']:.0f}", f"{last[f'val/{kind.score}']:.2f}"]
+        cells += [f"{last[f'val/{kind.score}_{rival}']:.2f}" for rival in kind.rivals]
         rows.append([*cells, f"{last['val/coverage']:.1%}" if "val/coverage" in last else ""])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def plot(curves: dict[str, list[Point]]) -> Figure:
-    """Plot the endpoint error over the seconds of training, and two methods without a network."""
+def plot(curves: dict[str, list[Point]], kind: Kind) -> Figure:
+    """Plot the score over the seconds of training, and two methods without a network."""
     figure = Figure(figsize=(6.4, 4.4), dpi=120, layout="constrained")
     axes = figure.subplots()
     for name, points in curves.items():
-        axes.plot([p["seconds"] for p in points], [p["val/epe"] for p in points], "-o", markersize=3, label=name)
+        axes.plot(
+            [p["seconds"] for p in points], [p[f"val/{kind.score}"] for p in points], "-o", markersize=3, label=name
+        )
     last = next(iter(curves.values()))[-1]
-    for key, label, color in (("identity", "do nothing", "#6b6b6b"), ("constant", "best constant flow", "#d95f02")):
-        axes.axhline(last[f"val/epe_{key}"], linestyle="--", color=color, label=label)
+    for (key, label), color in zip(kind.rivals.items(), ("#6b6b6b", "#d95f02"), strict=True):
+        axes.axhline(last[f"val/{kind.score}_{key}"], linestyle="--", color=color, label=label)
     axes.set_xlabel("seconds of the processor")
-    axes.set_ylabel("endpoint error (px at 1920x1080), lower is better")
+    axes.set_ylabel(kind.unit)
     axes.set_ylim(bottom=0)
     axes.grid(color="#e4e4e4", linewidth=0.8)
     axes.spines[["top", "right"]].set_visible(False)
@@ -143,7 +182,9 @@ def plot(curves: dict[str, list[Point]]) -> Figure:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS[:3]))
+    parser.add_argument("--task", choices=list(KINDS), default="undistort")
+    models = sorted({name for kind in KINDS.values() for name in kind.models})
+    parser.add_argument("--models", nargs="+", choices=models, help="by default the first three of the task")
     parser.add_argument("--seconds", type=float, default=240.0, help="of the processor, for each model, 240")
     parser.add_argument("--size", type=size, default=(192, 336), help="height and width of frames, 192x336")
     parser.add_argument("--scenes", type=count(16), default=512, help="rendered roads to train on, 512")

@@ -36,6 +36,7 @@ from torchrefract.robustness.scores import as_labels
 LIMIT = 1.2  # of the time of the evaluation over that of the model
 MODELS = ("opencv:hog", "torchvision:ssdlite320_mobilenet_v3_large", "torchvision:fasterrcnn_resnet50_fpn")
 _ONE_BOX = {"boxes": torch.tensor([[0.0, 0, 9, 9]]), "labels": torch.ones(1).long(), "scores": torch.ones(1)}
+SCENES = [name for name in QUANTITIES if name != "night_fog"]  # of frames by day
 
 
 def main() -> None:
@@ -65,7 +66,7 @@ def main() -> None:
 @lru_cache
 def scenes(width: int) -> Mapping[str, Mapping[int, Effect]]:
     """Return the scenes of the command for frames of a width, by name and severity."""
-    return {name: {s: getattr(presets, name)(s, width=width) for s in presets.SEVERITIES} for name in QUANTITIES}
+    return {name: {s: getattr(presets, name)(s, width=width) for s in presets.SEVERITIES} for name in SCENES}
 
 
 def scene_costs(frames: Sequence[Tensor]) -> dict[str, dict[int, float]]:

@@ -45,6 +45,7 @@ SETTINGS = {
     "highveld_heat_haze": Setting(detail=(0.6, 0.4, 3), arguments={"severity": 5}),
     "highveld_telephoto": Setting(detail=(0.6, 0.4, 3), arguments={"severity": 5}),
     "limpopo_sun_glare": Setting(road=5, arguments={"severity": 3}),
+    "night_fog": Setting(road=10, night=True, arguments={"glow": {"threshold": 0.5}}),
     "paper_refractive": Setting(seed=0),
     "unpaved_road": Setting(road=9),
     "PhysicalTurbulence": Setting(detail=(0.6, 0.4, 3)),

@@ -78,6 +78,15 @@ def shared_data() -> Path:
     return folder
 
 
+@pytest.fixture
+def memory(monkeypatch) -> Iterator[Any]:
+    """Return the empty store memory://, without pauses before further tries."""
+    monkeypatch.setattr("torchrefract._io._PAUSES", (0.0, 0.0, 0.0))
+    store: Any = importlib.import_module("fsspec").filesystem("memory")
+    yield store
+    store.rm("/", recursive=True)
+
+
 @pytest.fixture(scope="session")
 def s3() -> Iterator[dict[str, str]]:
     """Start a server of the S3 protocol with the empty s3://bucket; return the environment that names it."""

@@ -98,6 +98,11 @@ TINY = {
         "model.network.attention=[true,false]",
         "model.network.groups=4",
     ],
+    ("bridge", "deweather"): [
+        "model.network.widths=[8,8]",
+        "model.network.attention=[false,true]",
+        "model.network.groups=4",
+    ],
 }
 DATA = ["data.size=[32,64]", "data.train_count=4", "data.val_count=2", "data.batch_size=2", "data.workers=0"]
 

@@ -361,6 +361,31 @@ def test_another_camera_under_the_name_of_the_first_is_not_mixed_with_its_pictur
     assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
 
 
+@pytest.mark.parametrize("kind", ["coco", "yolo"])
+def test_dust_is_thicker_behind_the_vehicles_among_the_labels(call, folder, kind):
+    document = {
+        "images": [{"id": 1, "file_name": "a.png", "height": 48, "width": 96}],
+        "categories": [{"id": 3, "name": "Car"}, {"id": 1, "name": "person"}],
+        "annotations": [
+            {"id": i, "image_id": 1, "category_id": category, "bbox": box}
+            for i, (category, box) in enumerate([(3, [30.0, 20, 18, 14]), (1, [70.0, 20, 6, 14])])
+        ],
+    }
+    (folder / "labels.json").write_text(json.dumps(document))
+    (folder / "yolo").mkdir()
+    (folder / "yolo" / "a.txt").write_text("2 0.40625 0.5625 0.1875 0.2916667\n0 0.760417 0.5625 0.0625 0.2916667\n")
+    labels = ("labels=labels.json",) if kind == "coco" else ("labels=yolo", "scene.vehicle_labels=[2]")
+    words = ("source=raw/a.png", "out=out", "scene=unpaved_road", "scene.width=96", "maps=npz", "workers=0")
+    assert call("degrade", *words, *labels).code == 0
+    image, scene = read_image(folder / "raw" / "a.png")[None], presets.unpaved_road(width=96)
+    params = scene.sample(image, seed=0, keys=[key_of("a.png")])
+    dust = params.children[0]._replace(vehicles=torch.tensor([[[29.5, 19.5, 47.5, 33.5]]]))
+    expected = scene.apply(image, params._replace(children=(dust, *params.children[1:])))
+    with np.load(folder / "out" / "maps" / "a.maps.npz") as maps:
+        assert np.abs(maps["transmission"] - expected.transmission[0, 0].numpy()).max() < 1e-5
+    assert (expected.transmission - scene.apply(image, params).transmission).abs().max() > 0.1
+
+
 @pytest.mark.parametrize("kind", [".flo", ".png"])
 def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tmp_path, kind):
     # The picture moves by 3 px to the right and 1 px up from frame to frame.

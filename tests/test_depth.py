@@ -392,6 +392,46 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
 
 
+def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, memory, tmp_path, monkeypatch):
+    write_frames(tmp_path)
+    memory.put(str(tmp_path / "frames"), "/frames", recursive=True)
+    words = (f"network={network('metric')}", "scale_by=model", "batch=1")
+    stores = ("source=memory://frames", "out=memory://depth")
+    put = memory.put_file
+
+    def stop(source: str, target: str, **more: Any) -> None:
+        if target.endswith("c.png"):
+            raise KeyboardInterrupt
+        put(source, target, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(memory), "put_file", lambda _, *names, **more: stop(*names, **more))
+        assert call("estimate_depth", *words, *stores).code == 130
+    assert "memory://depth: 2 depth maps written" in call("estimate_depth", *words, *stores).out
+    assert "memory://depth: 0 depth maps written" in call("estimate_depth", *words, *stores).out
+    assert call("estimate_depth", *words, "source=frames", "out=depth").code == 0
+    for path in (tmp_path / "depth").rglob("*.png"):
+        assert memory.cat_file(f"/depth/{path.relative_to(tmp_path / 'depth').as_posix()}") == path.read_bytes()
+
+    options = ("scene=cape_town_fog", "source=frames", "workers=0")
+    for command, more in (("degrade", ()), ("generate", ("license=CC0",))):
+        for out, depth in ((f"{command}1", "depth"), (f"{command}2", "memory://depth")):
+            outcome = call(command, *options, *more, f"depth={depth}", f"out={out}")
+            assert (outcome.code, "assumes" in outcome.err) == (0, False)
+        first, second = ({p.name: p.read_bytes() for p in (tmp_path / f"{command}{k}").rglob("*.*g")} for k in (1, 2))
+        assert first == second
+        assert first
+    frames = [
+        FrameFolder(root, size=(28, 42), depth=depth)
+        for root, depth in (("frames", "depth"), ("memory://frames", "memory://depth"))
+    ]
+    for one, other in zip(*frames, strict=True):
+        assert one.depth.equal(other.depth)
+    memory.rm("/depth/a.png")
+    message = call("generate", *options, "license=CC0", "depth=memory://depth", "out=other").message
+    assert message.startswith("depth must be a folder with a map for each frame, got none for a.png in memory://depth")
+
+
 def test_a_run_without_a_map_leaves_no_folder_and_a_wrong_device_is_named(call, network, tmp_path):
     write_frames(tmp_path)
     words = ("source=frames", "out=depth", f"network={network('metric')}")

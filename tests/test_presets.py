@@ -8,13 +8,17 @@ from typing import Any
 
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from torchrefract import (
     Compose,
     DivergenceFree,
+    GroundPlaneDepth,
     HeterogeneousFog,
     LensDistortion,
     LensFlare,
+    NightGlow,
     OneOf,
     PhysicalTurbulence,
     RoadMirage,
@@ -27,6 +31,7 @@ from torchrefract import (
 )
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.base import Effect
+from torchrefract.fields.srgb import srgb_to_linear
 
 SIZE = (54, 96)
 SCENES: dict[str, Callable[..., Any]] = {
@@ -37,6 +42,7 @@ SCENES: dict[str, Callable[..., Any]] = {
 EFFECTS = {
     "cheap_dashcam": {LensDistortion},
     "cape_town_fog": {HeterogeneousFog},
+    "night_fog": {HeterogeneousFog, NightGlow},
     "limpopo_sun_glare": {SunGlare},
     "highveld_heat_haze": {RoadMirage, Turbulence},
     "highveld_telephoto": {PhysicalTurbulence},
@@ -50,10 +56,19 @@ RARELY: dict[str, Any] = {"p": 0.25}
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "cheap_dashcam": RARELY,
     "cape_town_fog": RARELY,
+    "night_fog": {"glow": RARELY, **RARELY},
     "limpopo_sun_glare": RARELY,
     "highveld_heat_haze": {"mirage": RARELY, **RARELY},
     "highveld_telephoto": RARELY,
     "unpaved_road": {"dust": RARELY, "haze": RARELY, "shutter": RARELY},
+}
+
+_PINHOLE = {"width": 640, "height": 360, "fx": 500.0, "fy": 510.0, "cx": 326.5, "cy": 179.5}
+PLACE: dict[str, Any] = {
+    "camera": Camera(**_PINHOLE, coefficients=(0.0,) * 4, model="opencv"),
+    "horizon": 0.4,
+    "depth": GroundPlaneDepth(),
+    "width": 640,
 }
 
 
@@ -140,6 +155,41 @@ def test_severities_have_the_documented_values():
         assert sum(flare.strength_range) / 2 == pytest.approx(0.2 * severity)
 
 
+@pytest.mark.quick
+def test_a_camera_that_meters_fog_by_day_darkens_it_and_leaves_the_night():
+    white, night = torch.full((1, 3, *SIZE), 0.75), torch.full((1, 3, *SIZE), 0.03)
+    white[:, :, 40:] = 0.3
+    night[:, :, 20:24, 40:44] = 0.6
+    for frame, is_darker in ((white, True), (night, False)):
+        scene: Any = presets.cape_town_fog(5, depth=GroundPlaneDepth(), exposure=True)
+        params = scene.sample(frame, seed=1)
+        foggy = scene.effects[0].apply(frame, params.children[0]).image
+        exposed = scene.apply(frame, params).image
+        assert torch.allclose(exposed, foggy, atol=1e-3) is not is_darker
+        assert exposed.mean() < 0.9 * foggy.mean() or not is_darker
+    assert 0.15 < srgb_to_linear(presets.cape_town_fog(5, exposure=True).degrade(white, seed=1).image).mean() < 0.3
+
+
+@pytest.mark.quick
+def test_lamps_shine_through_fog_at_night_in_a_glow():
+    frame = torch.full((1, 3, 90, 160), 0.05)
+    frame[:, :, 30:33, 80:83] = 1.0
+    frame[:, :, 30:33, 20:23] = 0.6  # a lit wall
+    depth = torch.full((1, 1, 90, 160), 30.0)
+    plain = presets.cape_town_fog(4).degrade(frame, seed=1, depth=depth).image
+    foggy = presets.night_fog(4, glow={"optical_depth_range": (2.0, 2.0)}).degrade(frame, seed=1, depth=depth).image
+    assert (plain[..., 31, 81] < 0.5).all()
+    assert (foggy[..., 31, 81] > 0.95).all()
+    assert (foggy[..., 31, 21] < 0.5).all()
+    assert (foggy[..., 31, 86] > 1.5 * foggy[..., 80, 86]).all()  # around the lamp
+    day = torch.full((1, 3, 90, 160), 0.7)
+    day[:, :, 60:] = 0.3
+    day[:, :, 70:73, 80:83] = 1.0
+    bright = presets.night_fog(4).degrade(day, seed=1, depth=depth)
+    assert bright.intensity.max() == 0
+    assert (bright.image[..., 71, 81] < 0.95).all()
+
+
 def test_severities_of_heat_haze_have_the_documented_cn2():
     for severity, cn2 in zip(presets.SEVERITIES, (8e-11, 3e-10, 7e-10, 1.5e-9, 2.8e-9), strict=True):
         (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, Turbulence))
@@ -187,21 +237,39 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
     def depth(image: torch.Tensor) -> torch.Tensor:
         return torch.full_like(image[:, :1], 50.0)
 
-    options = {"width": 640, "height": 360, "fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
-    camera = Camera(**options, coefficients=(0.0,) * 4, model="opencv")
+    camera = PLACE["camera"]
     scene = SCENES[name](camera=camera, horizon=0.4, depth=depth, width=640, **ARGUMENTS[name])
     for leaf in leaves(scene):
         assert leaf.p == 0.25
         view = getattr(leaf, "medium", leaf)
         assert getattr(view, "camera", camera) == camera
-        assert view.depth is (None if isinstance(leaf, LensDistortion | SunGlare) else depth)
+        assert view.depth is (None if isinstance(leaf, LensDistortion | SunGlare | NightGlow) else depth)
         assert getattr(leaf, "horizon", 0.4) == 0.4
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):
         SCENES[name](mistyped=1)
-    if name != "cheap_dashcam":
-        with pytest.raises(TypeError, match="camera must be a Camera, got int"):
-            SCENES[name](camera=1)
+
+
+@pytest.mark.quick
+def test_arguments_of_one_effect_may_come_from_a_configuration():
+    given = OmegaConf.create({"vehicle_labels": None, "dust": {"wake_length": 7.0}, "haze": {"length_range": [9, 9]}})
+    scene = instantiate({"_target_": "torchrefract.presets.unpaved_road", **given})
+    assert scene.effects[0].wake_length == 7.0
+    assert scene.effects[1].length_range == (9.0, 9.0)
+    glow = instantiate({"_target_": "torchrefract.presets.night_fog", "glow": {"threshold": 0.5}}).effects[1]
+    assert glow.threshold == 0.5
+
+
+@pytest.mark.quick
+def test_each_scene_takes_camera_horizon_depth_and_width_and_the_page_says_which_it_uses(scene):
+    lines = [line.split(maxsplit=1) for line in str(presets.__doc__).splitlines() if line.startswith("    ")]
+    used = {name for name in PLACE if name in dict(line for line in lines if len(line) == 2)[scene]}
+    assert used == {
+        name for name, value in PLACE.items() if repr(SCENES[scene](**{name: value})) != repr(SCENES[scene]())
+    }
+    SCENES[scene](**PLACE)
+    with pytest.raises(TypeError, match="camera must be a Camera, got int"):
+        SCENES[scene](camera=1)
 
 
 @pytest.mark.quick

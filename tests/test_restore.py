@@ -12,7 +12,7 @@ from torchrefract import warp
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli import restoration
 from torchrefract.data.images import pixels_of, read_image
-from torchrefract.data.media import video_info
+from torchrefract.data.media import read_video, video_info, write_video
 from torchrefract.fields.rectification import camera_flow
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
@@ -84,6 +84,26 @@ def test_pooled_frames_of_a_camera_are_restored_along_one_flow(call, tmp_path, d
         assert (read_image(tmp_path / "out" / f"{i}.png") - expected).abs().max() < 0.51 / 255 + 1e-4
     again = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", "pool=lens").out
     assert "out: 0 restored, 6 already existed" in again
+
+
+def test_each_video_is_restored_along_one_lens_by_a_model_that_finds_lenses(call, tmp_path, drive):
+    frames = [pixels_of(frame) for frame in drive((-0.16, 0.06), 6)]
+    (tmp_path / "raw").mkdir()
+    write_video(frames, tmp_path / "raw" / "a.mp4", fps=10, size=(480, 270))
+    write(tmp_path / "raw" / "b.png", frames[0])
+    (tmp_path / "raw" / "damaged.mp4").write_bytes(b"no video")
+    outcome = call("restore", "ckpt_path=lens_small", "input=raw", "out=out")
+    assert outcome.out.splitlines()[0].startswith("out/a.camera.yaml: k1 -0.")
+    assert "out: 2 restored, 0 already existed, 1 skipped" in outcome.out
+    assert written(tmp_path / "out") == ["a.camera.yaml", "a.mp4", "b.png", "config.json"]
+    flow = camera_flow(read_camera(tmp_path / "out" / "a.camera.yaml"))[0]
+    assert flow.abs().max() > 3
+    before, after = (dict(read_video(tmp_path / name / "a.mp4", range(6))) for name in ("raw", "out"))
+    for i, image in before.items():
+        expected = warp(image, flow, padding="border", interpolation="bicubic")[0].clamp(0, 1)
+        assert (after[i] - expected).abs().mean() < 0.01  # of the codec
+    assert call("restore", "ckpt_path=lens_small", "input=raw", "out=alone", "pool=null").code == 0
+    assert written(tmp_path / "alone") == ["a.mp4", "b.png", "config.json"]
 
 
 @pytest.mark.parametrize("tile", ["null", "[20,40]"])
@@ -232,7 +252,7 @@ def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
         (("batch=0",), "batch: batch must be at least 1, got 0"),
         (("interpolation=cubic",), "interpolation: interpolation must be one of nearest, bilinear, bicubic"),
         (("side_by_side=2",), "side_by_side: side_by_side must be True or False, got 2"),
-        (("pool=lens",), "pool must be null, or lens for the task undistort, got lens for deweather"),
+        (("pool=lens",), "pool must be auto, null, or lens for the task undistort, got lens for deweather"),
         (("device=gpu",), "device must be auto, cpu or another device of this machine, got gpu"),
         (("ckpt_path=none.ckpt",), "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
         (("ckpt_path=raw/a.png",), "ckpt_path must be an intact checkpoint, got raw/a.png, which is damaged"),

@@ -228,6 +228,31 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
     assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"
 
 
+def test_a_training_starts_with_the_weights_and_the_licenses_of_a_checkpoint(call, trained):
+    best = trained.folder / "best.ckpt"
+    words = ("trainer.max_epochs=1", "model.lr=0", f"init_from={best}", "run_dir=run")  # no step changes a weight
+    assert call("train", *trained.words, *words).code == 0
+    before, after = read_checkpoint(best), read_checkpoint(Path("run/last.ckpt"))
+    names = [name for name in before["state_dict"] if name.endswith((".weight", ".bias"))]
+    assert len(names) > 20
+    assert [name for name in names if not before["state_dict"][name].equal(after["state_dict"][name])] == []
+    assert after["licenses"][f"initial weights, {best}"] == before["licenses"]
+    assert OmegaConf.load("run/config.yaml").init_from == str(best)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("init_from=none.ckpt",), "init_from must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
+        (("init_from=lens_small",), "init_from must be a checkpoint of ResUNet (tu-test_resnet), which model= names"),
+        (("+task=deweather", "scene=cape_town_fog", "init_from=lens_small"), "init_from must be a checkpoint of the "),
+    ],
+)
+def test_initial_weights_of_another_model_are_one_line_of_error(call, small, words, message):
+    task = () if any(word.startswith("+task") for word in words) else ("+task=undistort",)
+    assert call("train", *task, *small, *words).message.startswith(message)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

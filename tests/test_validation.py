@@ -1,11 +1,15 @@
 import math
 import re
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
+from torchvision.transforms import v2
 
+import torchrefract as tr
 from torchrefract._validation import (
     check_choice,
     check_count,
@@ -171,3 +175,14 @@ def test_values_are_not_checked_while_compiling_or_inside_vmap():
 def test_eager_bool_returns_the_value_of_a_tensor_on_the_cpu():
     assert eager_bool(lambda: torch.tensor(True)) is True
     assert eager_bool(lambda: torch.tensor(False)) is False
+
+
+def test_a_warning_names_the_line_of_the_caller_whatever_calls_the_effect():
+    image = torch.rand(1, 3, 8, 8)
+    effects = tr.HeterogeneousFog(depth=tr.CorridorDepth()), tr.Turbulence(amplitude_range=(9, 9), length_range=(2, 2))
+    for effect in effects:
+        for call in (effect, nn.Sequential(effect), v2.Compose([effect])):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                call(image)
+            assert {warning.filename for warning in caught} == {__file__}

@@ -10,8 +10,8 @@ Effects, each an `nn.Module` from images to images; in parentheses what they sho
     Compose (several effects in order), OneOf (one of several, at random)
 
 Presets, in `torchrefract.presets`, are effects with the parameters of a place and a severity of 1 to 5:
-    cheap_dashcam, cape_town_fog, limpopo_sun_glare, highveld_heat_haze, highveld_telephoto, unpaved_road, and
-    paper_refractive and paper_weather, which draw one of several effects for each image
+    cheap_dashcam, cape_town_fog, night_fog, limpopo_sun_glare, highveld_heat_haze, highveld_telephoto, unpaved_road,
+    and paper_refractive and paper_weather, which draw one of several effects for each image
 
 Depth for fog: a map in m, `CorridorDepth`, `GroundPlaneDepth`, any function of the image, or a network
 (`torchrefract.depth.from_transformers`).

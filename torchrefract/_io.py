@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 from uuid import uuid4
@@ -58,6 +59,14 @@ def is_remote(path: Any) -> bool:
     return bool(getattr(path, "protocol", ""))
 
 
+def store_of(path: Path) -> Any:
+    """Return the file system of a path in a store; a forked process, as a worker of a DataLoader, gets a new one."""
+    store = cast(Any, path)
+    if getattr(store.fs, "_pid", None) in (None, os.getpid()):
+        return store.fs
+    return type(store.fs)(**store.storage_options)  # fsspec keeps one in each process
+
+
 def retried(call: Callable[[], _T], path: Path) -> _T:
     """Call a function that uses a store; wait and try again, three times at most, if it fails for another reason than
     a missing file or permission.
@@ -83,8 +92,9 @@ def retried(call: Callable[[], _T], path: Path) -> _T:
 
 def read_bytes(path: Path) -> bytes:
     """Read a file on this machine or in a store; errors are those of `retried`."""
-    store = cast(Any, path)
-    return retried(lambda: store.fs.cat_file(store.path), path) if is_remote(path) else path.read_bytes()
+    if not is_remote(path):
+        return path.read_bytes()
+    return retried(lambda: store_of(path).cat_file(cast(Any, path).path), path)
 
 
 def matching_files(folder: Path, pattern: str) -> list[Path]:
@@ -95,10 +105,34 @@ def matching_files(folder: Path, pattern: str) -> list[Path]:
         return []
 
 
+def sizes_in_store(root: Path) -> dict[str, int]:
+    """Return the size of each file of a folder in a store by its name relative to it, without hidden files."""
+    start, sizes = cast(Any, root).path.rstrip("/"), dict[str, int]()
+    folders = [start]
+    while folders:  # fsspec's `walk` leaves out a folder whose listing fails, in silence
+        folder = folders.pop()
+        for info in retried(partial(store_of(root).ls, folder, detail=True), root):
+            path = info["name"].rstrip("/")
+            name = path[len(start) :].lstrip("/")
+            if path == folder or "/." in f"/{name}":  # some stores list a folder in itself
+                continue
+            if info["type"] == "directory":
+                folders.append(path)
+            else:
+                sizes[name] = info["size"]
+    return sizes
+
+
+def relative_name(path: Path, root: Path) -> str:
+    """Return the name of a file in a folder, with forward slashes."""
+    if is_remote(path):  # `relative_to` takes a millisecond there
+        return str(path)[len(str(root).rstrip("/")) :].lstrip("/")
+    return path.relative_to(root).as_posix()
+
+
 def remove_file(path: Path) -> None:
     """Remove a file; in a store, `unlink` would take brackets in its name for a pattern."""
-    store = cast(Any, path)
-    retried(lambda: store.fs.rm_file(store.path), path) if is_remote(path) else path.unlink()
+    retried(lambda: store_of(path).rm_file(cast(Any, path).path), path) if is_remote(path) else path.unlink()
 
 
 @contextmanager
@@ -107,10 +141,9 @@ def local_file(path: Path) -> Iterator[Path]:
     if not is_remote(path):
         yield path
         return
-    store = cast(Any, path)
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
-        retried(lambda: store.fs.get_file(store.path, str(copy)), path)
+        retried(lambda: store_of(path).get_file(cast(Any, path).path, str(copy)), path)
         yield copy
 
 
@@ -133,10 +166,9 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
             overwrites what a killed one left.
     """
     if is_remote(path):
-        store = cast(Any, path)
         with tempfile.TemporaryDirectory() as folder:
             yield (temporary := Path(folder, path.name))
-            retried(lambda: store.fs.put_file(str(temporary), store.path), path)
+            retried(lambda: store_of(path).put_file(str(temporary), cast(Any, path).path), path)
         return
     # tempfile creates files that only their owner can read.
     name = f".{path.stem}.part{path.suffix}" if alone else f".{path.stem}-{uuid4().hex[:8]}{path.suffix}"

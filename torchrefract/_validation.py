@@ -2,8 +2,11 @@
 
 import math
 import numbers
+import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,11 +16,21 @@ from torch.autograd import forward_ad
 from torchrefract.types import Range
 
 _LARGEST = sys.float_info.max
+# The folders of torchrefract, and of PyTorch and of torchvision beside it.
+_LIBRARIES = str(Path(__file__).parent) + os.sep, str(Path(torch.__file__).parent)
 _SHOWN = 3  # examples in a message
 
 
 class UsageError(Exception):
     """An error of a command that the user can fix; the message says how."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line that led here, outside of torchrefract and of PyTorch and torchvision, which call effects."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_LIBRARIES):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def check_number(name: str, value: float, *, low: float = -_LARGEST, high: float = _LARGEST) -> float:

@@ -14,8 +14,8 @@ Options:
     maps=false              true writes flow, transmission and masks as PNG, as generate does; or npz, safetensors
     drive_by=folder         draw the pictures of each drive once, as the frames of a video: auto, folder or prefix
     depth=DIR               folder of depth maps, as estimate_depth writes
-    seed=0                  of the draws
-    workers=N               processes, each of which degrades one file at a time; default: one for each core
+    camera=FILE             camera file of the frames, see cameras/README.md; horizon=0.5 of their height, 0 at the top
+    workers=N               processes, each of which degrades one file at a time; seed=0 of the draws
 
 Examples:
     python -m torchrefract.degrade source=drive.mp4 out=fog scene=cape_town_fog

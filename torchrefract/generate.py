@@ -10,10 +10,11 @@ Options:
     license=TEXT            of the source, stated in the README of the set, required
     count=N                 number of pairs; default: one for each frame
     size=[720,1280]         [height, width] to which frames are cropped and reduced, px
-    maps=png                format of the maps; npz and safetensors have full precision
-    tar=N                   pairs in a tar of WebDataset's layout; default: files
-    val_share=0.2           share of the frames in the validation split
-    workers=N               processes; default: one for each core
+    depth=DIR               folder of depth maps, as estimate_depth writes
+    camera=FILE             camera file of the frames, see cameras/README.md; horizon=0.5 of their height, 0 at the top
+    tar=N                   pairs in a tar of WebDataset's layout; default: files; maps=png, or npz and safetensors,
+                            which have full precision
+    workers=N               processes; val_share=0.2 of the frames in the validation split
 
 Examples:
     python -m torchrefract.generate scene=paper_refractive source=frames out=pairs license="CC BY 4.0"

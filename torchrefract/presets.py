@@ -3,14 +3,27 @@
 `severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
 physical quantity, which each scene states, so that the score of a model can be plotted over it.
 
-All scenes but the paper's take the same keyword arguments, and ignore those that mean nothing for them:
+All scenes take the same keyword arguments about the frames, so that a loop over scenes can pass them to each:
 
     camera: of the frames, a `Camera` or a camera file; None is unknown, with a focal length of 0.9 widths.
     horizon: its position in the frame, 0 at the top edge and 1 at the bottom edge. Dashcams point slightly upward.
     depth: a depth provider or a function from images to their depth in m, for frames without a depth map. None is a
-        `CorridorDepth`, which warns that it is a guess.
+        `CorridorDepth`, which warns that it is a guess; for the paper's scenes it is the paper's.
     width: of the frames, px; displacements are stated for a width of 1920 px and scale with it.
-    arguments: of the effect of the scene, in place of their values here.
+
+A scene does not depend on all of them. The others change nothing:
+
+    cheap_dashcam       none, as it draws lenses of its own
+    cape_town_fog       camera, horizon, depth
+    night_fog           camera, horizon, depth
+    limpopo_sun_glare   camera
+    highveld_heat_haze  camera, horizon, depth, width
+    highveld_telephoto  camera, horizon, depth
+    unpaved_road        camera, horizon, depth, width
+    paper_refractive    depth (of the turbulence), width
+    paper_weather       camera, depth (of the fogs)
+
+Scenes but the paper's also take the arguments of their effect, in place of their values here.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,15 +32,17 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from torchrefract._validation import check_positive
+from torchrefract._validation import check_flag, check_positive
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.divergence_free import DivergenceFree
+from torchrefract.effects.exposure import Exposure
 from torchrefract.effects.flare import LensFlare
 from torchrefract.effects.fog import UniformFog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.night_glow import NightGlow
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence
 from torchrefract.effects.road_mirage import RoadMirage
 from torchrefract.effects.rolling_shutter import RollingShutter
@@ -36,12 +51,18 @@ from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import DepthProvider
+from torchrefract.labels.vehicles import VEHICLES
 from torchrefract.types import Range
 
 SEVERITIES = (1, 2, 3, 4, 5)
 
 _REFERENCE_WIDTH = 1920.0
 _HORIZON, _SPREAD = 0.55, 0.1  # an angle that varies from car to car
+_FOG_VISIBILITIES = [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)]  # m
+# Real fog by day has a mean of 0.17 to 0.2 of white in the pictures of dashcams.
+_FOG_EXPOSURE: dict[str, Any] = {"target_range": (0.16, 0.24), "gamma_range": (0.7, 1.0), "max_gain": 1.0}
+_NEAR_LAMP, _FAR_LAMP = 20.0, 40.0  # m, away from the camera; 3 d / V is their optical depth
+_LAMP_LUMINANCE = 20.0  # times white
 _LOW_SUN = (1.0, 0.94, 0.82)
 _TELEPHOTO_FOCAL = 4.0  # widths
 _T = TypeVar("_T")
@@ -66,18 +87,59 @@ def cape_town_fog(
     camera: _CameraSource = None,
     horizon: float = _HORIZON,
     depth: _DepthSource = None,
+    exposure: bool = False,
     **arguments: Any,
-) -> HeterogeneousFog:
+) -> HeterogeneousFog | Compose:
     """Create heterogeneous morning fog, through which the car drives at 50 to 70 km/h, at 30 frames per second.
 
-    Its color comes from the frame: that of the sky at the horizon, dark at night.
+    Its color comes from the frame: that of the sky at the horizon, dark at night. See `night_fog` for lamps in it.
 
     Args:
         severity: 1 to 5, visibility of 500 … 1000 m at 1, 60 … 200 m at 3, 20 … 40 m at 5.
         camera, horizon, depth: as for all scenes.
+        exposure: True for a camera that meters the foggy frame and darkens it, by `Exposure`: fog by day is gray in its
+            pictures, not white, and the road in it is dark. The scene is then a composition.
         arguments: of `HeterogeneousFog`, and those of all scenes.
     """
-    visibility = _at_severity(severity, [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0), (20.0, 40.0)])
+    fog = _morning_fog(_at_severity(severity, _FOG_VISIBILITIES), camera, horizon, depth, arguments)
+    # A camera that has opened for the night does not open further.
+    return Compose([fog, Exposure(**_FOG_EXPOSURE)]) if check_flag("exposure", exposure) else fog
+
+
+def night_fog(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    glow: dict[str, Any] | None = None,
+    **arguments: Any,
+) -> Compose:
+    """Create the fog of `cape_town_fog` at night: dark, with lamps that shine through it in a glow.
+
+    Frames by day have the fog alone.
+
+    Args:
+        severity: 1 to 5, visibility as for `cape_town_fog`; the glow is that of lamps 20 to 40 m away.
+        camera, horizon, depth: as for all scenes.
+        glow: arguments of `NightGlow`.
+        arguments: of `HeterogeneousFog`, and those of all scenes.
+    """
+    low, high = visibility = _at_severity(severity, _FOG_VISIBILITIES)
+    lamps = {"linear_light": True, "lamp_luminance": _LAMP_LUMINANCE}
+    of_glow: dict[str, Any] = {
+        "optical_depth_range": (3 * _NEAR_LAMP / high, 3 * _FAR_LAMP / low),
+        "luminance_range": (0.2 * _LAMP_LUMINANCE, 0.6 * _LAMP_LUMINANCE),
+        "camera": _camera(camera),
+    }
+    fog = _morning_fog(visibility, camera, horizon, depth, lamps | arguments)
+    # The lamps that the fog leaves bright glow: fog after the glow would hide it.
+    return Compose([fog, NightGlow(**of_glow | dict(glow or {}))])
+
+
+def _morning_fog(
+    visibility: Range, camera: _CameraSource, horizon: float, depth: _DepthSource, arguments: dict[str, Any]
+) -> HeterogeneousFog:
     options: dict[str, Any] = {
         "mode": "ray",
         "visibility_range": visibility,
@@ -133,7 +195,7 @@ def highveld_heat_haze(
     options: dict[str, Any] = {"difference_range": _around(kelvin, 0.2 * kelvin), "horizon": horizon}
     options |= _focal(place["camera"]) | ({} if depth is None else {"depth": depth})
     haze = _turbulence(amplitude, width, **{"depth": place["depth"]} | arguments)
-    return Compose([RoadMirage(**options | (mirage or {})), haze])
+    return Compose([RoadMirage(**options | dict(mirage or {})), haze])
 
 
 def highveld_telephoto(
@@ -165,6 +227,7 @@ def unpaved_road(
     horizon: float = _HORIZON,
     depth: _DepthSource = None,
     width: float = _REFERENCE_WIDTH,
+    vehicle_labels: Sequence[int | str] | None = VEHICLES,
     dust: dict[str, Any] | None = None,
     haze: dict[str, Any] | None = None,
     shutter: dict[str, Any] | None = None,
@@ -176,6 +239,8 @@ def unpaved_road(
             displacement 200 m away of 0.3, 0.8, 1.5 px, each +-20 %; time to read out a frame of 15, 25, 40 ms, and
             vibration of the pitch of 0.05, 0.12, 0.2 degrees. The car drives at 40 to 80 km/h.
         camera, horizon, depth, width: as for all scenes.
+        vehicle_labels: names or numbers of the classes of vehicles, behind which the dust is thicker where the target
+            of an image, or the labels of `degrade`, have boxes. Boxes of torchvision have numbers: pass those of yours.
         dust: arguments of `HeterogeneousFog`.
         haze: arguments of `Turbulence`.
         shutter: arguments of `RollingShutter`.
@@ -202,6 +267,7 @@ def unpaved_road(
         "wind_z_range": (-0.5, -0.3),
         "decorrelation_range": (30.0, 60.0),
         "scale_height_range": (1.5, 4.0),
+        "vehicle_labels": vehicle_labels,
         "horizon": horizon,
     }
     of_shutter: dict[str, Any] = {
@@ -213,27 +279,39 @@ def unpaved_road(
     }
     return Compose(
         [
-            HeterogeneousFog(**of_dust | place | (dust or {})),
-            _turbulence(amplitude, width, **{"depth": place["depth"]} | (haze or {})),
-            RollingShutter(**of_shutter | place | (shutter or {})),
+            HeterogeneousFog(**of_dust | place | dict(dust or {})),
+            _turbulence(amplitude, width, **{"depth": place["depth"]} | dict(haze or {})),
+            RollingShutter(**of_shutter | place | dict(shutter or {})),
         ]
     )
 
 
-def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, frame: str = "pad") -> OneOf:
+def paper_refractive(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+    frame: str = "pad",
+) -> OneOf:
     """Create the paper's four refractive distortions, one of them for each sample.
 
     Args:
         severity: 1 to 5, displacements of severity / 3 times the paper's; the lens is that of `cheap_dashcam`.
+        camera, horizon: change nothing.
+        depth: of the turbulence, which then moves far things more than near ones; None moves all alike, as the paper.
         width: of the frames, px.
         frame: of the lens, see `LensDistortion`. The paper's has a black border; Table 1 fills the frames.
     """
+    _camera(camera)
     scale = _at_severity(severity, [1 / 3, 2 / 3, 1.0, 4 / 3, 5 / 3])
     px = check_positive("width", width) / _REFERENCE_WIDTH
     return OneOf(
         [
             _cheap_lens(severity, frame=frame),
             Turbulence(
+                depth=depth,
                 amplitude_range=(0.5 * scale * px, 1.5 * scale * px),
                 length_range=(20.0 * px, 60.0 * px),
                 aperture_range=(3.0 * px, 5.0 * px),
@@ -244,18 +322,28 @@ def paper_refractive(severity: int = 3, *, width: float = _REFERENCE_WIDTH, fram
     )
 
 
-def paper_weather(severity: int = 3) -> OneOf:
+def paper_weather(
+    severity: int = 3,
+    *,
+    camera: _CameraSource = None,
+    horizon: float = _HORIZON,
+    depth: _DepthSource = None,
+    width: float = _REFERENCE_WIDTH,
+) -> OneOf:
     """Create the paper's three weather effects, one of them for each sample: uniform fog, heterogeneous fog or flare.
 
     Args:
         severity: 1 to 5, visibility of 300 m / severity, and light added at the sun of 0.2 severity +-0.05.
+        camera: of the frames, for the distance along the rays of the fogs; None is the depth alone, as in the paper.
+        horizon, width: change nothing.
+        depth: of the fogs; None is the ramp over the rows of the paper, `LinearDepth`.
     """
     visibility, strength = _at_severity(severity, [(300 / s, 0.2 * s) for s in SEVERITIES])
-    limits = (visibility, visibility)
+    fog: dict[str, Any] = {"visibility_range": (visibility, visibility), "camera": _camera(camera), "depth": depth}
     return OneOf(
         [
-            UniformFog(visibility_range=limits),
-            HeterogeneousFog(visibility_range=limits),
+            UniformFog(**fog),
+            HeterogeneousFog(**fog),
             LensFlare(strength_range=_around(strength, 0.05)),
         ]
     )
@@ -281,7 +369,8 @@ def _focal(camera: Camera | None) -> dict[str, float]:
 
 
 def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an effect, without those that all scenes take."""
+    """Return the arguments of an effect, without those that all scenes take; check the camera."""
+    _camera(arguments.get("camera"))
     return {name: value for name, value in arguments.items() if name not in ("camera", "horizon", "depth", "width")}
 
 

@@ -8,8 +8,9 @@ Options:
     out=preview.png         .gif, .webp, .apng and .mp4 are animations, other formats contact sheets
     scene=NAME              a scene in place of all effects: cheap_dashcam, cape_town_fog, paper_weather, ...
     scene.severity=3        1 to 5
-    depth=FILE              depth of the picture: 16-bit PNG, or .npy in m
-    depth_scale=0.00390625  m per step of the PNG
+    depth=PATH              depth of the picture: 16-bit PNG, or .npy in m; a folder of maps, one for each frame, as
+                            estimate_depth writes them; depth_scale=0.00390625 m per step of PNGs
+    camera=FILE             camera file of the frames, see cameras/README.md; horizon=0.5 of their height, 0 at the top
     size=[540,960]          [height, width] to which the picture is cropped and reduced, px
     frames=48               largest number of frames of an animation
     fps=12                  frames per second of an animation

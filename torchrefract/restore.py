@@ -8,8 +8,8 @@ Options:
     out=restored            output folder; names and subfolders are those of the input
     size=[720,1280]         [height, width] to which frames are resized for the model; default: that of its training
     tile=512                px or [height, width]; the model sees tiles of a frame instead of the resized frame
-    pool=null               lens: one lens for all files, of one camera, from the model's flows and straight edges, so
-                            that the result does not shake; it is written to camera.yaml in the output folder
+    pool=auto               one lens for each video, from a lens model's flows and straight edges, so that the result
+                            does not shake; lens: one for all files, of one camera; null: each frame alone
     interpolation=bicubic   of the warp along a predicted flow; or bilinear
     side_by_side=false      true writes the input to the left of the restoration
     batch=4                 pictures, frames or tiles that are restored together

@@ -8,21 +8,23 @@ pytestmark = pytest.mark.filterwarnings(  # of Lightning: a training of seconds 
 )
 
 
-def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeypatch, capsys):
-    words = ["learning.py", "--models", "ddpm", "lens_net", "--seconds", "1", "--size", "32x56", "--scenes", "16"]
-    monkeypatch.setattr("sys.argv", [*words, "--val", "2", "--out", str(tmp_path)])
+@pytest.mark.parametrize(
+    ("task", "names", "seconds"), [("undistort", ["ddpm", "lens_net"], 1), ("deweather", ["fog_net"], 3)]
+)
+def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeypatch, capsys, task, names, seconds):
+    words = ["learning.py", "--task", task, "--models", *names, "--seconds", str(seconds), "--size", "32x56"]
+    monkeypatch.setattr("sys.argv", [*words, "--scenes", "16", "--val", "2", "--out", str(tmp_path)])
     learning.main()
     first = capsys.readouterr().out
-    names = ["ddpm", "lens_net"]
-    curves = {name: json.loads((tmp_path / f"{name}_32x56_16_2_1s.json").read_text()) for name in names}
+    curves = {name: json.loads((tmp_path / f"{name}_{task}_32x56_16_2_{seconds}s.json").read_text()) for name in names}
+    score = learning.KINDS[task].score
     for points in curves.values():
         assert [p["seconds"] for p in points] == sorted(p["seconds"] for p in points)
         assert [p["steps"] for p in points] == [(i + 1) * points[0]["steps"] for i in range(6)]
-        assert points[-1]["seconds"] == pytest.approx(1, rel=0.8)
-        assert points[-1]["val/epe_identity"] == curves["ddpm"][0]["val/epe_identity"]
-    assert 0 <= curves["ddpm"][-1]["val/coverage"] <= 1
-    assert "val/coverage" not in curves["lens_net"][-1]
-    assert (tmp_path / "curves.png").stat().st_size > 0
+        assert points[-1]["seconds"] == pytest.approx(seconds, rel=0.8)
+        assert points[-1][f"val/{score}_identity"] == curves[names[0]][0][f"val/{score}_identity"]
+    assert {name for name in names if 0 <= curves[name][-1].get("val/coverage", -1) <= 1} == {"ddpm"} & {*names}
+    assert (tmp_path / f"{task}.png").stat().st_size > 0
     learning.main()
     assert first.endswith(again := capsys.readouterr().out)
     assert again.count("|\n") == 2 + len(names)  # the table alone

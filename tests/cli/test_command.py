@@ -301,7 +301,7 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
         (
             "model=unet",
-            "model must be one of ddpm, ddpm_cat256, ddpm_image, fog_net, lens_net, resunet, segformer, got unet",
+            "model must be one of bridge, ddpm, ddpm_cat256, ddpm_image, fog_net, lens_net, resunet, segformer, got un",
         ),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),

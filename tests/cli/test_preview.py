@@ -86,7 +86,19 @@ def pictures_of(path: Path) -> list[np.ndarray]:
 def flare_at(frame: torch.Tensor, t: int) -> np.ndarray:
     """Return a frame (1, 3, 24, 32) with the scene's flare at time t as displayed, (240, 320, 3)."""
     image = limpopo_sun_glare().degrade(frame, seed=3, frame=t).image[0]
+    return as_displayed(image)
+
+
+def as_displayed(image: torch.Tensor) -> np.ndarray:
+    """Return (3, 24, 32) as an animation shows it, (240, 320, 3)."""
     return (255 * image).round().byte().repeat_interleave(10, 1).repeat_interleave(10, 2).movedim(0, -1).numpy()
+
+
+def write_video(path: Path, frames: list[torch.Tensor]) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
+    for frame in frames:
+        writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
+    writer.release()
 
 
 # --- contact sheets
@@ -372,6 +384,37 @@ def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
         assert shows(shown, large.movedim(0, -1).numpy())
 
 
+@pytest.mark.parametrize("source", ["drive", "drive.avi"])
+def test_each_frame_of_an_animation_has_its_map_of_a_folder(call, frames, tmp_path, source):
+    names = [f"frame{t}" for t in range(3)]
+    if source == "drive.avi":
+        write_video(tmp_path / source, frames)
+        frames = [frame for _, frame in read_video(tmp_path / source, range(12))]
+        names = [f"{source}/{t:06d}" for t in range(3)]
+    depths = [torch.full((1, 1, 24, 32), 5.0 + 40 * t) for t in range(3)]
+    for name, depth in zip(names, depths, strict=True):
+        (path := tmp_path / "depth" / f"{name}.npy").parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, depth[0, 0])
+    outcome = call("preview", source, *FOG, "depth=depth", "frames=3", "out=fog.apng")
+    assert (outcome.code, outcome.err) == (0, "")
+    for t, (picture, depth) in enumerate(zip(pictures_of(tmp_path / "fog.apng"), depths, strict=True)):
+        image = cape_town_fog().degrade(frames[t], seed=0, depth=depth, frame=t).image[0]
+        assert shows(picture, as_displayed(image)), t
+    missing = "frame3.png" if source == "drive" else source
+    message = call("preview", source, *FOG, "depth=depth", "frames=4", "out=fog.apng").message
+    assert f"depth must be a folder with a map for each frame, got none for {missing} in depth" in message
+    assert call("preview", source, *FOG, "depth=depth", "frames=4").code == 0  # a contact sheet shows the first alone
+
+
+def test_one_depth_map_for_all_frames_of_a_drive_is_said(call, frames, picture, tmp_path):
+    np.save(tmp_path / "depth.npy", meters())
+    words = (*FOG, "depth=depth.npy", "frames=2")
+    warning = "warning: depth.npy is one depth map for all 2 frames; depth= takes a folder with one for each"
+    assert warning in call("preview", "drive", *words, "out=fog.gif").err
+    assert call("preview", "drive", *words, "out=fog.png").err == ""
+    assert call("preview", "frame.png", *words, "out=fog.gif").err == ""
+
+
 @pytest.mark.parametrize(("max_frames", "count"), [(3, 3), (100, 12)])
 def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path, max_frames, count):
     outcome = call("preview", "drive", *FLARE, "out=flare.apng", f"frames={max_frames}")
@@ -383,10 +426,7 @@ def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path, 
 
 def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, frames, tmp_path):
     path = tmp_path / "a: 100%05d.avi"  # neither a protocol nor a pattern of names
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
-    for frame in frames:
-        writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
-    writer.release()
+    write_video(path, frames)
     decoded = [frame for _, frame in read_video(path, range(12))]
     assert call("preview", path.name, *FLARE, "out=flare.apng").out.endswith("12 frames\n")
     for t, shown in enumerate(pictures_of(tmp_path / "flare.apng")):

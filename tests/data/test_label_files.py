@@ -14,7 +14,15 @@ from torch import Tensor
 
 from torchrefract import LensDistortion, warp_boxes, warp_mask, warp_points
 from torchrefract._validation import UsageError
-from torchrefract.data.label_files import CocoAnnotations, CocoLabels, LabelFolder, MaskFile, YoloFile, read_labels
+from torchrefract.data.label_files import (
+    CocoAnnotations,
+    CocoLabels,
+    LabelFolder,
+    MaskFile,
+    YoloFile,
+    read_labels,
+    yolo_rows,
+)
 
 SIZE = HEIGHT, WIDTH = (60, 80)
 BOX = {"id": 1, "bbox": [10.0, 20.0, 30.0, 16.0], "category_id": 2, "area": 480.0, "iscrowd": 0, "note": "kept"}
@@ -117,6 +125,27 @@ def test_an_invalid_line_of_a_yolo_file_is_named(tmp_path, line):
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize(
+    "keypoints",
+    [
+        *("0.45 0.4 2 0.55 0.6 2", "0.45 0.4 1 0.55 0.6 0", "0.45 0.4 1 0 0 0 0.5 0.5 2", "0.45 0.4 1"),
+        "0.45 0.4 0 0.55 0.4 1 0.55 0.6 1 0.45 0.6 1",
+    ],
+)
+def test_keypoints_of_yolo_are_no_corners_of_a_polygon(tmp_path, keypoints):
+    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.2 0.3 {keypoints}\n")
+    with pytest.raises(ValueError, match=r"line 1, must be .*, got keypoints x y visibility .*as a COCO JSON"):
+        YoloFile(tmp_path / "a.txt").move(shift(1.0, 0.0), SIZE)
+
+
+@pytest.mark.quick
+def test_a_polygon_along_the_border_and_a_byte_order_mark_are_read(tmp_path):
+    numbers = [0, 0, 0.5, 0.2, 1, 0, 1, 0.6, 0, 1]  # of five corners, 1 and 1 where keypoints have visibilities
+    (tmp_path / "a.txt").write_text(f"0 {' '.join(map(str, numbers))}\r\n", encoding="utf-8-sig")
+    assert yolo_rows((tmp_path / "a.txt").read_bytes(), tmp_path / "a.txt") == [("0", numbers)]
+
+
+@pytest.mark.quick
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "color", "palette", "bit"])
 def test_masks_keep_every_bit_and_their_form(tmp_path, kind):
     path, generator = tmp_path / "a.png", np.random.default_rng(0)
@@ -197,6 +226,12 @@ def test_a_json_of_coco_may_have_sizes_as_text_and_other_entries(tmp_path):
         ),
         ({"annotations": [BOX | {"image_id": 0, "polygon": [1, 2, 3, 4, 5, 6]}]}, "has polygon, positions that would"),
         ({"annotations": [BOX | {"image_id": 0, "vbox": [1, 2, 3, 4]}]}, "has vbox, positions that would stay"),
+        ({"annotations": [BOX | {"image_id": 0, "bbox2D_proj": [1, 2, 3, 4]}]}, "has bbox2D_proj, positions that"),
+        (
+            {"annotations": [BOX | {"image_id": 0, "bbox_mode": 0}]},
+            "has a bbox of bbox_mode 0, which is not x, y, width",
+        ),
+        ({"annotations": [BOX | {"image_id": 0, "bbox": [0.1, 0.2, 0.3, 0.4]}]}, "boxes in px, got .* shares of the"),
         ({"annotations": [BOX | {"image_id": 0, "attributes": {"rotation": 30.0}}]}, "a box that is turned by 30"),
         ({"annotations": [{"image_id": 0, "segments_info": []}]}, "panoptic labels, which cannot be moved"),
         ({"images": 2 * [{"id": 0, "file_name": "0.png", "height": 1, "width": 1}]}, "must list each image once"),

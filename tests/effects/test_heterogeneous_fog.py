@@ -327,3 +327,26 @@ def test_fog_lit_by_the_sun_is_removed_with_the_map_of_its_airlight():
     assert (without.image - degraded.image).abs().max() > 0.02
     with pytest.raises(ValueError, match=r"params\.sun\[:, 2\] must"):
         effect.apply(image, degraded.params._replace(sun=degraded.params.sun + 1))
+
+
+def test_lamps_in_dark_fog_are_never_brighter_than_in_clear_air_and_have_gradients():
+    image = picture(1, 3, 6, 8).double()
+    image[..., 2, 3], image[..., 4, 5] = 0.97, 1.0
+    depth = torch.linspace(1.0, 60.0, 48, dtype=torch.float64).view(1, 1, 6, 8)
+    options: dict[str, Any] = {"mode": "ray", "visibility_range": (80.0, 80.0), "airlight": 0.1, "linear_light": True}
+    plain, lamps = (HeterogeneousFog(**options, lamp_luminance=value) for value in (1.0, 20.0))
+    params = lamps.sample(image, seed=2)
+    foggy, lit = (effect.apply(image, params, depth=depth).image for effect in (plain, lamps))
+    assert (lit >= foggy - 1e-12).all()
+    assert (lit <= torch.maximum(image, torch.tensor(0.1).double()) + 1e-12).all()
+    assert (lit[..., 4, 5] == 1).all()
+    assert (foggy[..., 4, 5] < 0.6).all()
+    is_lamp = (image.amax(dim=1, keepdim=True) >= 0.85).expand_as(image)
+    assert torch.equal(lit[~is_lamp], foggy[~is_lamp])
+    clear = params._replace(visibility=torch.full_like(params.visibility, 1e9))
+    assert_close(lamps.apply(image, clear, depth=depth).image, image, rtol=0, atol=1e-6)
+    by_day = params._replace(airlight=torch.full_like(params.airlight, 0.8))
+    plain_day, lamps_day = (effect.apply(image, by_day, depth=depth).image for effect in (plain, lamps))
+    assert_close(lamps_day, plain_day, rtol=0, atol=1e-6)
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: lamps.apply(x, params, depth=depth).image, image, atol=1e-5)

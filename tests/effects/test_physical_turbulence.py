@@ -13,6 +13,7 @@ from torchrefract import Camera, Compose, GroundPlaneDepth, LensDistortion, Phys
 from torchrefract.fields import physical_turbulence
 from torchrefract.fields.physical_turbulence import (
     Air,
+    fried_parameter,
     height_gain,
     layer_gradients,
     layer_shares,
@@ -253,6 +254,26 @@ def test_from_physics_is_the_effect_with_these_numbers():
     physical = Turbulence.from_physics((1e-11, 1e-10), height=2.0, wind=1.0, aperture=0.01)
     same = PhysicalTurbulence(cn2_range=(1e-11, 1e-10), height=2.0, wind_x_range=(-1.0, 1.0), aperture=0.01)
     assert torch.equal(physical.degrade(image, seed=1).flow, same.degrade(image, seed=1).flow)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("cn2", [1e-14, 3e-12])
+@pytest.mark.parametrize("distance", [50.0, 1000.0])
+def test_fried_s_parameter_is_that_of_quadrature(cn2, distance):
+    k = 2 * math.pi / 500e-9
+    path = integrate.quad(lambda s: cn2 * (1 - s / distance) ** (5 / 3), 0, distance, epsabs=0)[0]
+    expected = (0.423 * k**2 * path) ** -0.6
+    assert fried_parameter(cn2, distance, wavelength=500e-9) == pytest.approx(expected, rel=1e-9)
+    assert fried_parameter(0.0, distance) == math.inf
+
+
+@pytest.mark.quick
+def test_the_plan_says_where_a_short_exposure_would_be_blurred():
+    for aperture, cn2, ratio in ((0.002, 1e-12, None), (0.002, 1e-11, "3.1"), (0.05, 1e-12, "19.4")):
+        effect = PhysicalTurbulence(cn2_range=(0.0, cn2), aperture=aperture)
+        left_out = f"the blur of short exposures is left out, D / r0 is up to {ratio}"
+        assert (left_out in str(effect.plan(1080, 1920))) == (ratio is not None)
+        assert (effect.blur_ratio > 1) == (ratio is not None)
 
 
 def test_a_displacement_below_the_tolerance_is_not_computed():

@@ -196,3 +196,10 @@ class Dimmer(PhotometricEffect):
 def test_saved_params_of_an_effect_of_another_package_are_loaded_with_weights_only():
     params = Dimmer().sample(random_image(2, 3, *SIZE), seed=7)
     assert_close(saved_and_loaded(params), params, rtol=0, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.trace")  # PyTorch's, of its own function
+@pytest.mark.parametrize("name", EFFECTS)
+def test_a_trace_raises_and_names_what_draws_anew(name):
+    with pytest.raises(TypeError, match=r"use torch\.export\.export or torch\.compile"):
+        torch.jit.trace(EFFECTS[name](), random_image())

@@ -100,7 +100,7 @@ def test_an_untrained_denoiser_knows_only_that_the_numbers_are_standard_normal()
 
 
 def test_another_task_and_invalid_numbers_raise():
-    with pytest.raises(TypeError, match="task must be Undistort for FlowDiffusion: add model=ddpm_image"):
+    with pytest.raises(TypeError, match="task must be Undistort for FlowDiffusion: add model=bridge"):
         FlowDiffusion(small, Deweather())
     invalid: list[tuple[dict[str, Any], str]] = [
         ({"steps": 1001}, "steps must be at most"),

@@ -3,7 +3,6 @@
 import json
 import re
 import reprlib
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from torchrefract._io import replace_file
+from torchrefract._validation import warn
 from torchrefract.cameras.camera import Camera
 
 _MAX_MESSAGE = 400  # characters of a parser's error to repeat
@@ -129,10 +129,9 @@ class Document:
         except (ValueError, OverflowError) as error:
             raise ValueError(f"path must hold a camera, got {self.path}: {error}") from error
         if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _FARTHEST_CENTER and min(width, height) > _LARGEST_ICON:
-            warnings.warn(
+            warn(
                 f"{self.path} has its principal point at ({cx:g}, {cy:g}), far from the middle of {width} x {height} "
-                "px; if the frames were calibrated at another size, state that size and use camera.resized",
-                stacklevel=2,
+                "px; if the frames were calibrated at another size, state that size and use camera.resized"
             )
         return camera
 

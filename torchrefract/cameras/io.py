@@ -5,7 +5,6 @@ ValueError with the name of the file if it does not hold what they describe. Wri
 cannot hold the camera; readers of the path find the old file or the complete new one.
 """
 
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -16,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from torchrefract._validation import check_choice
+from torchrefract._validation import check_choice, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.colmap import colmap_rows, is_colmap, read_colmap, write_colmap
 from torchrefract.cameras.documents import (
@@ -335,10 +334,9 @@ def _document_camera(
     if not coefficients and model == "fisheye":
         raise ValueError(f"path must hold the four coefficients of a fisheye, got {path} without")
     if len(coefficients) == 4 and model is None:
-        warnings.warn(
+        warn(
             f"the four coefficients of {path} are taken as k1, k2, p1, p2, since it states no lens model; add "
-            "fisheye_model: 1 if they are those of cv2.fisheye, or fisheye_model: 0; or state model= in read_camera",
-            stacklevel=2,
+            "fisheye_model: 1 if they are those of cv2.fisheye, or fisheye_model: 0; or state model= in read_camera"
         )
     return document.camera(size, pinhole, coefficients or [0.0] * 4, model or "opencv")
 

@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -29,9 +29,10 @@ from rich.progress import track
 from torch import nn
 from yaml import YAMLError
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, as_path, is_remote
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
+from torchrefract.cli.stores import check_addresses, disk_errors
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.fields.corridor import CorridorDepth
@@ -48,7 +49,7 @@ _MULTIRUN = ("-m", "--multirun")
 # Options whose value is text, mostly the path of a file: Hydra's syntax in it means nothing. The model of robustness is
 # a file or a function, that of other commands the choice of a group, without a dot.
 _TEXT_OPTION = re.compile(
-    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|base|out|ckpt_path|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
+    r"(\+{0,2}(?:image|images|input|data|labels|weights|source|files|depth|network|checkpoint|camera|scene\.camera|base|out|ckpt_path|init_from|license|run_dir|data\.root|data\.depth|hydra\.run\.dir"
     r"|model(?==.*[./])|hydra\.sweep\.dir|hydra\.sweep\.subdir|model\.network\.pretrained))=(.*)",
     re.DOTALL,
 )
@@ -58,9 +59,6 @@ _TASK_OPTIONS = ("+task=", "++task=", "+experiment=", "++experiment=")  # an exp
 _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c")
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
-_REMOTE_OUTPUT = re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
-_REMOTE_INPUT = re.compile(r"(input|source|images?|labels|depth|camera|base)=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$")
-_REMOTE_OPTIONS = (("generate", "out"), ("merge", "out"), ("train", "run_dir"), ("eval", "run_dir"))
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
     ".*does not have many workers.*",
@@ -96,7 +94,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
     with _one_line_errors(name), _one_line_warnings():
-        _check_addresses(name, sys.argv[1:])
+        check_addresses(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
 
@@ -145,23 +143,6 @@ def quote_text(override: str, *, is_multirun: bool = False) -> str:
             return override
         return f"{option}=" + ",".join(_quote(part, is_literal=_exists(part)) for part in text.split(","))
     return f"{option}={_quote(text, is_literal=exists or not is_path)}"
-
-
-def _check_addresses(name: str, arguments: list[str]) -> None:
-    """Raise UsageError if an option is an address, of which pathlib would make a path in a folder such as "s3:".
-
-    Outputs of `_REMOTE_OPTIONS` and the source of `generate` may be addresses.
-    """
-    for argument in arguments:
-        if (match := _REMOTE_OUTPUT.match(argument)) and (name, match[1]) not in _REMOTE_OPTIONS:
-            raise UsageError(
-                f"{match[1]} must be a path on this machine, got {match[2]}; write to a folder and copy it, or mount "
-                "the storage"
-            )
-        if (match := _REMOTE_INPUT.match(argument)) and (name, match[1]) != ("generate", "source"):
-            raise UsageError(
-                f"{match[1]} must be a path on this machine, got {match[2]}; copy it to a folder, or mount the storage"
-            )
 
 
 def require_task(name: str, arguments: list[str]) -> list[str]:
@@ -249,6 +230,17 @@ def naming(part: str) -> Iterator[None]:
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
         raise UsageError(f"{part}: {error}") from error
+
+
+@contextmanager
+def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
+    """Yield the paths or addresses of the options `source` and `out`; errors of a store for `out` become one line."""
+    with naming("source"):
+        source = as_path(str(cfg.source))
+    with naming("out"):
+        out = as_path(str(cfg.out))
+    with disk_errors(out) if is_remote(out) else nullcontext():
+        yield source, out
 
 
 def warn_of_assumed_depth(effect: nn.Module) -> None:

@@ -7,7 +7,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -20,7 +20,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import as_path, is_remote, make_folder, relative_name, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, check_choice, check_count, check_positive, first_names
 from torchrefract.cli.command import (
     check_none_lost,
@@ -29,13 +29,17 @@ from torchrefract.cli.command import (
     make,
     naming,
     progress,
+    source_and_out,
     warn_of_assumed_depth,
 )
+from torchrefract.cli.place import place_scene
+from torchrefract.cli.stores import check_memory
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.frames import drives_of
-from torchrefract.data.images import is_lost, pixels_of, read_image
+from torchrefract.data.images import is_lost, local_copy, pixels_of, read_image
+from torchrefract.data.label_boxes import category_names, labeled_boxes
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -45,16 +49,19 @@ from torchrefract.data.label_files import (
     PictureLabels,
     read_labels,
 )
+from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import FORMATS, encode_maps
 from torchrefract.data.pairs.generator import maps_of
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
+from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.random import key_of
 from torchrefract.types import Degraded
 
 _Labels = CocoLabels | LabelFolder | FlowFolder
 
+_SAMPLES = 16  # files of a store whose headers are read before a run
 _JOURNAL = ".labels.jsonl"  # annotations of finished pictures, for the next run
 
 
@@ -94,6 +101,7 @@ class Degrader(NamedTuple):
     is_alone: bool  # neither labels nor maps are written
     root: Path  # of the source
     shots: dict[str, _Shot] | None  # of pictures, by name; None draws each one
+    names: dict[int, str]  # of the categories of a COCO JSON
 
     def target(self, name: str) -> Path:
         """Return the path of a degraded file."""
@@ -101,17 +109,18 @@ class Degrader(NamedTuple):
 
     def __call__(self, task: _Task) -> _Result:
         """Degrade a file; write its labels and maps first, so that a complete file has them."""
-        target = self.target(task.name)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        file, target = task.file, self.target(task.name)
+        make_folder(target.parent)
         try:
-            with torch.no_grad(), replace_file(target, alone=True) as path:
-                return self._video(task, path) if media.is_video(task.file) else self._picture(task, path)
+            with torch.no_grad(), local_copy(task.file) as file, replace_file(target, alone=True) as path:
+                return (self._video if media.is_video(task.file) else self._picture)(task, file, path)
         except (ValueError, TypeError) as error:
-            reason = str(error) if str(task.file) in str(error) else f"{task.file}: {error}"
+            reason = str(error).replace(str(file), str(task.file))
+            reason = reason if str(task.file) in reason else f"{task.file}: {reason}"
             return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
 
-    def _picture(self, task: _Task, path: Path) -> _Result:
-        degraded = self._degraded(task.file, task.name)
+    def _picture(self, task: _Task, file: Path, path: Path) -> _Result:
+        degraded = self._degraded(file, task.name, task.labels)
         result = _Result(task.file, task.name, num_frames=1)
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
@@ -121,37 +130,46 @@ class Degrader(NamedTuple):
             else:
                 _write(self.out / "labels" / PurePosixPath(task.name).with_suffix(task.labels.path.suffix), content)
         self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
-        media.write_picture(degraded.image[0], path, source=task.file)
+        media.write_picture(degraded.image[0], path, source=file)
         return result
 
-    def _degraded(self, file: Path, name: str) -> Degraded:
+    def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()
+        depth = self._depth(name, image)
         with _no_warnings():
-            effect, depth = self._effect(image), self._depth(name, image)
-            if self.shots is None:
-                return effect.degrade(image, seed=self.seed, keys=[key_of(name)], depth=depth)
-            drive, first, frame = self.shots[name]
-            path = self.root / first
-            (height, width), params = _draw_drive(effect, drive, path, self.seed, path.stat().st_mtime_ns)
-            if image.shape[2:] != (height, width):
-                raise ValueError(
-                    f"pictures of a drive must have the size of its first one, {first}, {width}x{height}, got "
-                    f"{image.shape[3]}x{image.shape[2]}"
-                )
+            effect = self._effect(image)
+            params, frame = self._params(effect, image, name)
+            if labels is not None and not isinstance(labels, FlowFile) and uses_boxes(effect):
+                boxes = labeled_boxes(labels, (image.shape[2], image.shape[3]), self.names)
+                params = with_vehicles(effect, params, [boxes])
             return effect.apply(image, params, frame=frame, depth=depth)
+
+    def _params(self, effect: Effect, image: Tensor, name: str) -> tuple[Any, int]:
+        """Return what is drawn for a picture, or for its drive, and its number among the frames of that draw."""
+        if self.shots is None:
+            return effect.sample(image, seed=self.seed, keys=[key_of(name)]), 0
+        drive, first, frame = self.shots[name]
+        path = self.root / first
+        (height, width), params = _draw_drive(effect, drive, path, self.seed, path.stat().st_mtime_ns)
+        if image.shape[2:] != (height, width):
+            raise ValueError(
+                f"pictures of a drive must have the size of its first one, {first}, {width}x{height}, got "
+                f"{image.shape[3]}x{image.shape[2]}"
+            )
+        return params, frame
 
     def _moved(self, file: Path, labels: PictureLabels | FlowFile, degraded: Degraded) -> MovedLabels:
         if isinstance(labels, FlowFile):
             following = degraded
             if degraded.has("flow"):
-                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following)
+                following = self._degraded(file.with_name(PurePosixPath(labels.following).name), labels.following, None)
             with _no_warnings():
                 return MovedLabels(labels.move(degraded, following), 0)
         has_flow = degraded.has("flow") and bool(degraded.flow.any())
         height, width = degraded.image.shape[2:]
         return labels.move(degraded.flow[0] if has_flow else None, (height, width))
 
-    def _video(self, task: _Task, path: Path) -> _Result:
+    def _video(self, task: _Task, file: Path, path: Path) -> _Result:
         def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
             effect = params = None
             for t, frame in enumerate(frames):
@@ -164,7 +182,7 @@ class Degrader(NamedTuple):
                 self._write_maps(degraded, PurePosixPath(task.name, f"{t:06d}"))
                 yield pixels_of(degraded.image[0])
 
-        return _Result(task.file, task.name, num_frames=media.convert_video(task.file, path, change=change))
+        return _Result(task.file, task.name, num_frames=media.convert_video(file, path, change=change))
 
     def _effect(self, image: Tensor) -> Effect:
         return _make_effect(self.scene, image.shape[3] if self.has_width else None)
@@ -211,7 +229,7 @@ def _by_number(name: str) -> list[str | int]:
 
 
 def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with replace_file(path, alone=True) as temporary:
         temporary.write_bytes(data)
 
@@ -226,16 +244,26 @@ def _no_warnings() -> Iterator[None]:
 
 def degrade(cfg: DictConfig) -> None:
     """Degrade the pictures and videos that are not in the output folder yet; print their number and the rate."""
-    source, out = (Path(str(path)).expanduser() for path in (cfg.source, cfg.out))
+    with source_and_out(cfg) as (source, out):
+        _degrade(cfg, source, out)
+
+
+def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
     files = media.find_media(source, deep=True, name="source")
     media.check_output_folder(out, source, deep=True, name="source")
     root = source if source.is_dir() else source.parent
-    names = {file.relative_to(root).as_posix(): file for file in files}
+    names = {relative_name(file, root): file for file in files}
     pictures = [name for name, file in names.items() if not media.is_video(file)]
     labels = _labels(cfg, pictures)
     job = _job(cfg, out, root, pictures, labels)
     with naming("workers"):
         workers = num_cores() if cfg.workers is None else check_count("workers", cfg.workers, low=0)
+    check_memory(workers, out=out, source=source, **({"depth": job.depth.root} if job.depth else {}))
+    if is_remote(out) and isinstance(labels, CocoLabels):
+        raise UsageError(
+            f"out must lie on this machine for labels of COCO, which a run continues line by line, got {out}; write to "
+            "a folder and copy it"
+        )
     with naming("out"):
         claim(out, _settings(cfg, root, job, labels), count=0, about={}, earlier={"files": None, "drives": None})
     with locked("out", out):
@@ -244,10 +272,11 @@ def degrade(cfg: DictConfig) -> None:
             _Task(file, name, labels.of(name) if labels and not media.is_video(file) else None)
             for name, file in names.items()
         ]
+        stored = sizes_in_store(out) if is_remote(out) else None
         missing = [
             task
             for task in tasks
-            if not media.is_complete(task.file, job.target(task.name))
+            if not _is_complete(task, job, stored)
             or (isinstance(labels, CocoLabels) and task.labels and task.name not in finished)
         ]
         _warn([task.file for task in missing], tasks, labels)
@@ -256,6 +285,12 @@ def degrade(cfg: DictConfig) -> None:
             moved = dict(_read_journal(out))
             content = labels.with_moved({name: moved[name] for name in pictures if name in moved})
             _write(out / "labels" / labels.path.name, content)
+
+
+def _is_complete(task: _Task, job: Degrader, stored: Mapping[str, int] | None) -> bool:
+    """Return True if a file is degraded; stores, whose files are listed, hold no part of one."""
+    target = job.target(task.name)
+    return media.is_complete(task.file, target) if stored is None else relative_name(target, job.out) in stored
 
 
 def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, names: dict[str, Path]) -> None:
@@ -297,6 +332,7 @@ def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
 def _job(cfg: DictConfig, out: Path, root: Path, pictures: Sequence[str], labels: _Labels | None) -> Degrader:
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
+    place_scene(cfg)
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
@@ -308,7 +344,9 @@ def _job(cfg: DictConfig, out: Path, root: Path, pictures: Sequence[str], labels
         warn_of_assumed_depth(effect)
     else:
         with naming("depth_scale"):
-            depth = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
+            scale = check_positive("depth_scale", cfg.depth_scale)
+        with naming("depth"):
+            depth = DepthFolder(as_path(str(cfg.depth)), scale)
         depth.check((name, None) for name in pictures)
     if maps or labels:
         stems = Counter(str(PurePosixPath(name).with_suffix("")) for name in pictures)
@@ -320,9 +358,10 @@ def _job(cfg: DictConfig, out: Path, root: Path, pictures: Sequence[str], labels
     is_given = any(word.lstrip("+").startswith("scene.width=") for word in HydraConfig.get().overrides.task)
     scene = json.dumps(OmegaConf.to_container(cfg.scene, resolve=True))
     has_width = "width" in cfg.scene and not is_given
-    return Degrader(
-        scene, has_width, check_seed(cfg.seed), depth, maps, out, not (maps or labels), root, _shots(cfg, pictures)
-    )
+    names = category_names(labels) if isinstance(labels, CocoLabels) else {}
+    shots = _shots(cfg, pictures)
+    is_alone = not (maps or labels)
+    return Degrader(scene, has_width, check_seed(cfg.seed), depth, maps, out, is_alone, root, shots, names)
 
 
 def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None) -> dict[str, Any]:
@@ -343,6 +382,8 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
 
 
 def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None) -> None:
+    if missing and is_remote(missing[0]):  # the header of each file would cost a request for all of it
+        missing = missing[:: len(missing) // _SAMPLES or 1]
     messages = media.describe_losses(missing, upright=True)
     if labels:
         messages.append(media.describe_turned(missing, upright=True))

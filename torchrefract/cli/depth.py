@@ -11,12 +11,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from torchrefract._io import make_folder, matching_files, relative_name
 from torchrefract._validation import UsageError, check_count
-from torchrefract.cli.command import find_device, make, naming, progress
+from torchrefract.cli.command import find_device, make, naming, progress, source_and_out
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 
 
@@ -28,13 +30,17 @@ class _Frame(NamedTuple):
 
 def estimate_depth(cfg: DictConfig) -> None:
     """Write the depth maps of a picture, a video or a folder that are not in the output folder yet."""
-    source, out = Path(str(cfg.source)).expanduser(), Path(str(cfg.out)).expanduser()
+    with source_and_out(cfg) as (source, out):
+        _estimate_depth(cfg, source, out)
+
+
+def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     with naming("batch"):
         size = check_count("batch", cfg.batch)
     files = media.find_media(source, deep=True, name="source")
     media.check_output_folder(out, source, deep=True, name="source")
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent
-    pictures = [file.relative_to(root).as_posix() for file in files if not media.is_video(file)]
+    pictures = [relative_name(file, root) for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
     cfg.device = str(find_device(str(cfg.device)))
     try:
@@ -46,7 +52,7 @@ def estimate_depth(cfg: DictConfig) -> None:
     with naming("out"):
         if (out / "config.json").is_file():
             _claim(cfg, out, root)
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
     skipped, spreads = dict[str, str](), list[float]()
     num_written = 0
     with locked("out", out):
@@ -58,7 +64,7 @@ def estimate_depth(cfg: DictConfig) -> None:
                     continue
                 if num_written == 0:
                     _claim(cfg, out, root)
-                frame.target.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(frame.target.parent)
                 write_depth(frame.target, result.depth[0].cpu())
                 num_written += 1
                 spreads += [] if result.spread is None else [result.spread]
@@ -72,7 +78,7 @@ def estimate_depth(cfg: DictConfig) -> None:
 
 def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
     """Note the settings in the output folder; raise UsageError if its maps are of another network, road or source."""
-    names = [path.name for path in out.iterdir() if not path.name.startswith(".")]
+    names = [path.name for path in matching_files(out, "*") if not path.name.startswith(".")]
     if names and "config.json" not in names:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
@@ -85,13 +91,13 @@ def _missing_frames(
 ) -> Iterator[_Frame]:
     """Yield the frames that have no map yet; name those that cannot be read."""
     for file in files:
-        name = file.relative_to(root).as_posix()
+        name = relative_name(file, root)
         try:
             if media.is_video(file):
                 for index, image in media.read_video(file, count()):
-                    if not folder.path(name, index).is_file():
+                    if not folder.has(name, index):
                         yield _Frame(image[0], folder.path(name, index), f"{name}#{index}")
-            elif not folder.path(name).is_file():
+            elif not folder.has(name):
                 yield _Frame(read_image(file), folder.path(name), name)
         except UnreadableImageError as error:
             _skip(skipped, name, str(error))

@@ -8,6 +8,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._io import CONFIG_DIR
+from torchrefract.cameras.camera import Camera
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import DepthProvider
@@ -113,7 +114,7 @@ def _kind(config: Any) -> tuple[Any, Any] | None:
 
 
 def _is_allowed(value: Any) -> bool:
-    is_class = isinstance(value, type) and issubclass(value, Effect | DepthProvider)
+    is_class = isinstance(value, type) and issubclass(value, Effect | DepthProvider | Camera)
     return is_class or (isfunction(value) and value.__module__ in _MODULES and not value.__name__.startswith("_"))
 
 

@@ -1,12 +1,10 @@
 """The command that writes pairs to disk: its options, its output folder, its progress and its last line."""
 
-import errno
 import os
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -31,10 +29,13 @@ from torchrefract._validation import (
     first_names,
 )
 from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
+from torchrefract.cli.place import place_scene
+from torchrefract.cli.stores import check_memory, disk_errors
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.card import summarize, write_card
+from torchrefract.data.pairs.configuration import claim, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -48,13 +49,14 @@ from torchrefract.data.pairs.manifest import (
     LOST,
     Manifest,
     PairRow,
-    claim,
     find_manifests,
     locked,
     locked_shard,
     scan_rows,
 )
+from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
+from torchrefract.data.pairs.table import PairTable
 from torchrefract.data.workers import map_in_processes, num_cores
 from torchrefract.effects.base import Effect
 
@@ -62,7 +64,6 @@ _T = TypeVar("_T")
 
 _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the manifest state all
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
 _VERSIONS = {"torch": torch.__version__, "numpy": np.__version__, "opencv": cv2.__version__}
 _MESSAGE_INTERVAL = 60.0  # seconds
@@ -115,7 +116,10 @@ def generate(cfg: DictConfig) -> None:
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
             about = {"license": options.license, "made_with": _VERSIONS}
-            previous = claim(out, options.settings, count=options.num_pairs, about=about, earlier={"device": "cpu"})
+            suffix, num_pairs = shard_suffix(*options.shard), options.num_pairs
+            previous = claim(
+                out, options.settings, count=num_pairs, about=about, earlier={"device": "cpu"}, suffix=suffix
+            )
             options.write_list()
         if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
             print(f"existing pairs were made with {versions}, new ones are made with {_VERSIONS}: bytes may differ")
@@ -165,6 +169,7 @@ def _is_repaired(row: PairRow, options: Options) -> bool:
 
 
 def _parse(cfg: DictConfig, out: Path) -> Options:
+    camera = place_scene(cfg, size=None if cfg.size is None else _checked(cfg, "size", check_size))
     effect = make(cfg, "scene")
     if not isinstance(effect, Effect):
         raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
@@ -187,11 +192,11 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
     if engine["name"] == "ray" and workers == 0:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
+    if engine["name"] == "ray" and engine["address"]:
+        check_cluster(str(engine["address"]))
     with naming("source"):
         source = as_path(str(cfg.source))
-    for name, path in (("out", out), ("source", source)):
-        if workers and "memory" in getattr(path, "protocol", ""):
-            raise UsageError(f"workers must be 0 for {name}={path}, because each process has its memory, got {workers}")
+    check_memory(workers, out=out, source=source)
     if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
@@ -202,11 +207,14 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     sources = listed.limited(num_pairs)
     depth = None
     if cfg.depth is not None:
-        depth = DepthFolder(Path(str(cfg.depth)).expanduser(), _checked(cfg, "depth_scale", check_positive))
+        with naming("depth"):
+            folder = as_path(str(cfg.depth))
+        check_memory(workers, depth=folder)
+        depth = DepthFolder(folder, _checked(cfg, "depth_scale", check_positive))
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
-    reader = SourceReader(sources.root, plain["size"], depth)
+    reader = SourceReader(sources.root, plain["size"], depth, camera)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"], plain["device"])
     settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
     return Options(
@@ -295,9 +303,10 @@ def _report(options: Options, complete: set[int], damaged: int) -> None:
 def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) -> None:
     """Print the estimated size of the missing pairs; raise UsageError if the disk has less space."""
     tasks = [options.task(number) for number in missing[:: max(1, len(missing) // _SAMPLES)][:_SAMPLES]]
-    # A process takes the memory of the compiled effects with it when it ends.
+    # A process takes the memory of the compiled effects with it when it ends; with Ray, it would serve nothing else.
     # Sizes on the CPU are those on a GPU, which the machine that starts Ray's actors may lack.
-    work, workers = options.generator._replace(device="cpu").generate, min(1, options.workers)
+    work = options.generator._replace(device="cpu").generate
+    workers = 0 if options.engine["name"] == "ray" else min(1, options.workers)
     samples = [*map_in_processes(work, tasks, workers=workers, preload="torchrefract.data.pairs.generator")]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
     if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
@@ -337,12 +346,14 @@ def _with_progress(units: Iterable[list[PairRow]], *, total: int) -> Iterator[li
 def _finish(options: Options, out: Path, *, num_made: int) -> None:
     """Write the card if all shards have finished, and print the last line."""
     rows = scan_rows(find_manifests(out), lambda row: row.number < options.num_pairs, skip_invalid=True)
-    summary = summarize(row for row, _ in rows)
+    table = PairTable(options.settings)
+    summary = summarize(table.collect(row for row, _ in rows))
     num_complete, num_skipped = summary.splits.total(), len(summary.skipped)
     missing = options.num_pairs - num_complete - num_skipped
     if num_complete == 0 and not missing:
         raise UsageError(f"source must hold readable frames, got {summary.skipped[0]}")
     if not missing:
+        table.write(out)
         write_card(out, summary, settings=options.settings, license_text=options.license)
     rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""
@@ -356,22 +367,3 @@ def list_unreadable(reasons: Sequence[str]) -> None:
         print(f"unreadable, tried again by the same command: {reason}")
     if len(reasons) > _SHOWN:
         print(f"and {len(reasons) - _SHOWN} more, which the manifest names")
-
-
-@contextmanager
-def disk_errors(out: Path) -> Iterator[None]:
-    """Turn errors of the disk into messages for the user; pairs that are written stay."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in _DISK_FULL:
-            raise UsageError(
-                f"out must have enough space, got {os.strerror(error.errno).lower()} for {error.filename or out}; "
-                "existing pairs are complete, and the same command continues"
-            ) from error
-        raise UsageError(
-            f"out must be a folder that can be written to, got {out} ({error.strerror or error})"
-        ) from error
-    except KeyboardInterrupt:
-        print("stopped; the same command continues")
-        raise SystemExit(130) from None

@@ -102,7 +102,7 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             reason = str(error)
             print(f"skipped: {reason}", file=sys.stderr)
     if num_read == 0:
-        raise UsageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
+        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
 
 
 def _load_network(cfg: DictConfig) -> Predictor:

@@ -8,13 +8,16 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from torchrefract._io import as_path, read_bytes
+from torchrefract._io import as_path, read_bytes, remove_file
 from torchrefract._validation import UsageError, check_flag, first_names
 from torchrefract.cli.command import naming
-from torchrefract.cli.generation import disk_errors, list_unreadable
+from torchrefract.cli.generation import list_unreadable
+from torchrefract.cli.stores import disk_errors
 from torchrefract.data.images import opened
 from torchrefract.data.pairs.card import summarize, write_card
+from torchrefract.data.pairs.configuration import check_shards, shard_configs
 from torchrefract.data.pairs.manifest import Manifest, find_manifests, locked_shard, scan_rows
+from torchrefract.data.pairs.table import PairTable
 
 
 def merge(cfg: DictConfig) -> None:
@@ -24,12 +27,14 @@ def merge(cfg: DictConfig) -> None:
     verify = check_flag("verify", cfg.verify)
     settings, count, license_text = _configuration(out)
     with disk_errors(out), locked_shard(out, 0, 1):
+        count = check_shards(out, settings, count)
         num_rows = _count_lines(out)
         _check_configuration(out, settings, count)
         manifest = Manifest(out, 0, 1)
         complete, _ = manifest.open(lambda number: number < count, verify=verify, is_repaired=lambda _: False)
         draws = Counter((row.seed, row.key) for row, _ in scan_rows([manifest.path], lambda row: not row.skipped))
-        summary = summarize(row for row, _ in scan_rows([manifest.path], lambda _: True))
+        table = PairTable(settings)
+        summary = summarize(table.collect(row for row, _ in scan_rows([manifest.path], lambda _: True)))
         list_unreadable(summary.skipped)
         print(
             f"{out}: {summary.splits.total()} of {count} pairs, {len(summary.skipped)} frames are unreadable, "
@@ -42,7 +47,10 @@ def merge(cfg: DictConfig) -> None:
             )
         if repeated := [str(key) for (_, key), times in draws.items() if times > 1]:
             raise UsageError(f"out must hold each draw once, got pairs that share the keys {first_names(repeated)}")
+        table.write(out)
         write_card(out, summary, settings=settings, license_text=license_text)
+        for path in shard_configs(out):
+            remove_file(path)
 
 
 def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
@@ -57,7 +65,7 @@ def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
 
 
 def _check_configuration(out: Path, settings: Mapping[str, Any], count: int) -> None:
-    """Raise UsageError if rows are of another seed or scene, as of shards that were copied into one folder."""
+    """Raise UsageError if rows are of another seed or scene, as of shards that were copied without their options."""
     rows = (row for row, _ in scan_rows(find_manifests(out), lambda row: row.number < count, skip_invalid=True))
     expected = settings["scene"]["name"], settings["seed"]
     # The seed of a draw holds that of the set in its upper bits, see `draw_of`.

@@ -1,7 +1,8 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
 import re
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -15,29 +16,40 @@ from torch import Tensor
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.cli.command import check_seed, make, naming, progress, warn_of_assumed_depth
-from torchrefract.data.depth_maps import crop_depth, read_depth
+from torchrefract.cli.place import place_scene
+from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
 from torchrefract.data.images import EXTENSIONS, files_in, fit, read_image
 from torchrefract.data.media import VIDEOS, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
-from torchrefract.visualization.animation import FrameSequence, animation_formats, make_animation, save_animation
+from torchrefract.visualization.animation import (
+    DepthSource,
+    FrameSequence,
+    animation_formats,
+    make_animation,
+    save_animation,
+)
 from torchrefract.visualization.figures import contact_sheet, contact_sheet_row
 
 _RENDERED_SIZE = (540, 960)  # height and width
 _MAX_FPS = 50.0  # many viewers take the shorter delays that a GIF can hold for no delay
+
+_MapName = tuple[str, int | None]  # of a picture, or of a video with the number of its frame, as `DepthFolder` takes
 
 
 class _Source(NamedTuple):
     """Frames to degrade."""
 
     frames: FrameSequence
-    depth: Tensor | None  # (1, 1, H, W), m
+    depth: DepthSource
     name: str
     note: str  # on the depth
 
 
 def preview(cfg: DictConfig) -> None:
     """Write a contact sheet of effects on the first frame or, if the format is one of animations, an animation."""
+    with naming("size"):
+        place_scene(cfg, size=None if cfg.size is None else check_size("size", cfg.size))
     seed, effects = check_seed(cfg.seed), _effects(cfg)
     with naming("fps"):
         fps = check_number("fps", cfg.fps, low=0.1, high=_MAX_FPS)
@@ -59,11 +71,12 @@ def preview(cfg: DictConfig) -> None:
 
 def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, path: Path) -> None:
     _, frame = next(source.frames.read([0]))
+    depth = source.depth(0) if callable(source.depth) else source.depth
     rows = []
     items = progress(effects.items(), "drawing the effects; a first run compiles for a minute", count=len(effects))
     for name, effect in items:
         with naming(name):
-            rows.append(contact_sheet_row(name, effect, frame=frame, depth=source.depth, seed=seed))
+            rows.append(contact_sheet_row(name, effect, frame=frame, depth=depth, seed=seed))
     height, width = frame.shape[2:]
     contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}").savefig(path)
 
@@ -98,26 +111,27 @@ def _source(cfg: DictConfig) -> _Source:
             image, depth = render_road_scenes(torch.tensor([cfg.seed]), *(size or _RENDERED_SIZE))
         return _Source(_repeat(image, max_frames), depth, "a rendered road scene, as no picture was given", "")
     path = Path(str(cfg.image))
-    frames, name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
-    _, first = next(frames.read([0]))
-    depth, note = (None, "") if cfg.depth is None else _read_depth(cfg, first, size)
+    (frames, maps), name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
+    depth, note = (None, "") if cfg.depth is None else _depth(cfg, frames, maps, size)
     resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
     return _Source(resized, depth, name, note)
 
 
-def _read_frames(path: Path, max_frames: int) -> FrameSequence:
-    """Read the first frames of a folder or a video; repeat a picture."""
+def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_MapName]]:
+    """Return the first frames of a folder or a video, or a picture that repeats, and names of their depth maps."""
     if path.is_dir():
         files = sorted(files_in(path), key=_natural_order)[:max_frames]
         if not files:
             raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
-        return FrameSequence(len(files), lambda times: _read_folder(files, times))
+        maps = [(file.name, None) for file in files]
+        return FrameSequence(len(files), lambda times: _read_folder(files, times)), maps
     if path.suffix.lower() in VIDEOS:
         num_frames = sum(1 for _ in read_video(path, range(max_frames)))
         if num_frames == 0:
             raise UsageError(f"image must be a video with a frame that can be decoded, got {path}")
-        return FrameSequence(num_frames, lambda times: read_video(path, times))
-    return _repeat(read_image(path)[None].contiguous(), max_frames)
+        names = [(path.name, t) for t in range(num_frames)]
+        return FrameSequence(num_frames, lambda times: read_video(path, times)), names
+    return _repeat(read_image(path)[None].contiguous(), max_frames), [(path.name, None)]
 
 
 def _repeat(image: Tensor, num_frames: int) -> FrameSequence:
@@ -147,14 +161,29 @@ def _fit(frame: Tensor, size: tuple[int, int] | None) -> Tensor:
         return frame if size is None else fit(frame[0], size)[None]
 
 
-def _read_depth(cfg: DictConfig, image: Tensor, size: tuple[int, int] | None) -> tuple[Tensor, str]:
-    """Read the depth (1, 1, h, w), m, of an image (1, 3, H, W) that is cropped and reduced to a size, and a note."""
+def _depth(
+    cfg: DictConfig, frames: FrameSequence, maps: Sequence[_MapName], size: tuple[int, int] | None
+) -> tuple[DepthSource, str]:
+    """Return the depth of frames that are cropped and reduced to a size, from a map or a folder of maps, and a note."""
     with naming("depth_scale"):
         scale = check_positive("depth_scale", cfg.depth_scale)
-    path = Path(str(cfg.depth))
+    path, is_animation = Path(str(cfg.depth)), Path(str(cfg.out)).suffix.lower() in animation_formats()
+    _, first = next(frames.read([0]))
+    height, width = first.shape[2:]
+    if path.is_dir():
+        folder = DepthFolder(path, scale)
+        folder.check(maps if is_animation else maps[:1])
+        last = len(maps) - 1  # a picture that repeats has one map
+        return lambda t: folder.read(*maps[min(t, last)], frame_size=(height, width), size=size)[None], ""
+    if is_animation and maps[1:]:
+        print(
+            f"warning: {path} is one depth map for all {len(maps)} frames; depth= takes a folder with one for each, as "
+            "estimate_depth writes",
+            file=sys.stderr,
+        )
     depth, missing = read_depth(path, scale=scale)
     with naming("depth"):
-        depth = crop_depth(depth, (image.shape[2], image.shape[3]), size, name=str(path))
+        depth = crop_depth(depth, (height, width), size, name=str(path))
     return depth[None], f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
 
 

@@ -24,10 +24,20 @@ from torch import Tensor
 
 from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
+from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
-from torchrefract.data.images import UnreadableImageError, is_lost, pixels_of, read_image
+from torchrefract.cli.place import place_scene
+from torchrefract.data.frames import FrameFolder
+from torchrefract.data.images import (
+    UnreadableImageError,
+    check_frame_of_camera,
+    image_size,
+    is_lost,
+    pixels_of,
+    read_image,
+)
 from torchrefract.data.media import (
     check_output_folder,
     convert_video,
@@ -40,19 +50,22 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
-from torchrefract.data.pairs.manifest import claim, locked
+from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
     how_to_continue,
     load_model,
+    load_weights,
     num_epochs_done,
     read_checkpoint,
 )
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
 from torchrefract.restoration.models.coordconv import weights_license
+from torchrefract.restoration.models.lens_net import LensEncoder
 from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, write_weights
 from torchrefract.restoration.tasks import Undistort
@@ -69,7 +82,9 @@ def train(cfg: DictConfig) -> None:
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
-    model.origin = _origin(cfg, data)
+    initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
+    licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)
+    model.origin = _origin(cfg, data, initial_licenses=licenses)
     _save_config(cfg, trainer)
     run = as_path(cfg.run_dir)
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
@@ -135,10 +150,8 @@ def restore(cfg: DictConfig) -> None:
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
     with locked("out", out):
-        if cfg.pool is not None:
-            predict = flow_predictor(job.restorer.model, job.restorer.size, job.device)
-            camera = estimate_camera(files, out / "camera.yaml", predict=predict, upright=True)
-            job = job._replace(restore_images=LensRestorer(camera, interpolation=job.restorer.interpolation))
+        if cfg.pool == "lens":
+            job = job.with_one_lens(files, out / "camera.yaml")
         _restore_missing(files, job, out)
 
 
@@ -188,10 +201,13 @@ def export(cfg: DictConfig) -> None:
 def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, dict[str, Any] | None]:
     """Instantiate data, model and trainer, check that they fit together, and read the checkpoint at `ckpt_path`."""
     OmegaConf.resolve(cfg)
+    camera = _place_scene(cfg)
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     data, model = make(cfg, "data"), make(cfg, "model")
+    if camera is not None:
+        _check_camera(camera, data)
     try:
         trainer = make(cfg, "trainer")
     except MisconfigurationException as error:
@@ -218,6 +234,26 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     return data, model, trainer, checkpoint
 
 
+def _place_scene(cfg: DictConfig) -> Camera | None:
+    """Give the scene the camera and the horizon of the options; return the camera of the frames in the files."""
+    if cfg.camera is None and cfg.horizon is None:
+        return None
+    if not (cfg.data.get("root") and "effect" in cfg.data):
+        raise UsageError("camera and horizon must be those of frames in a folder, data=frames, got other data")
+    camera = place_scene(cfg, size=cfg.data.get("size"))
+    cfg.data.effect = cfg.scene
+    return camera
+
+
+def _check_camera(camera: Camera, data: PairData) -> None:
+    """Raise UsageError if the first frame of a drive, which has one camera, has another shape than the camera's."""
+    for frames in (data.train, data.val):
+        assert isinstance(frames, FrameFolder)  # as `_place_scene` checked
+        for frame in dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values():
+            height, width = image_size(frame)
+            check_frame_of_camera(camera, str(frame), height=height, width=width)
+
+
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
     if trainer.is_global_zero:
         with naming("run_dir"):
@@ -227,11 +263,13 @@ def _save_config(cfg: DictConfig, trainer: Trainer) -> None:
                 OmegaConf.save(cfg, temporary)
 
 
-def _origin(cfg: DictConfig, data: PairData) -> dict[str, Any]:
+def _origin(cfg: DictConfig, data: PairData, *, initial_licenses: Any) -> dict[str, Any]:
     """Return what a checkpoint holds of its origin: configuration, training data, and licenses by source."""
     source, network = fingerprint(data.train), cfg.model.network
     weights = weights_license(network.encoder) if "encoder" in network and network.get("pretrained") else None
     licenses = {"data": source["license"], "pretrained weights": weights}
+    if cfg.init_from is not None:
+        licenses[f"initial weights, {cfg.init_from}"] = initial_licenses
     return {"config": OmegaConf.to_container(cfg, enum_to_str=True), "data": source, "licenses": licenses}
 
 
@@ -240,6 +278,7 @@ class _Job(NamedTuple):
 
     restorer: Restorer
     restore_images: Callable[[Sequence[Tensor]], list[Tensor]]  # by the restorer, or by the lens of all frames
+    pools_videos: bool  # each video has one lens
     source: Path  # outputs are named by the path of a file relative to this folder
     out: Path
     batch: int
@@ -251,6 +290,12 @@ class _Job(NamedTuple):
 
     def is_done(self, file: Path) -> bool:
         return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
+
+    def with_one_lens(self, files: Sequence[Path], camera: Path) -> "_Job":
+        """Estimate one lens for files of one camera, write the camera, and return a job that restores by it."""
+        predict = flow_predictor(self.restorer.model, self.restorer.size, self.device)
+        lens = estimate_camera(files, camera, predict=predict, upright=True)
+        return self._replace(restore_images=LensRestorer(lens, interpolation=self.restorer.interpolation))
 
     def restore(self, images: Sequence[Tensor]) -> Iterator[Tensor]:
         """Restore images (3, H, W) in [0, 1]; `side_by_side` puts the image to the left of its restoration."""
@@ -273,12 +318,16 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         tile = None if sides is None else check_size("tile", sides)
     if tile is not None and loaded.task == Undistort.name:
         raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
-    if cfg.pool not in (None, "lens") or (cfg.pool and loaded.task != Undistort.name):
-        raise UsageError(f"pool must be null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}")
+    if cfg.pool not in (None, "auto", "lens") or (cfg.pool == "lens" and loaded.task != Undistort.name):
+        raise UsageError(
+            f"pool must be auto, null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}"
+        )
     with naming("interpolation"):
         options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
         restorer = Restorer(loaded.model.to(device), size=size, **options)
-    return _Job(restorer, restorer, source, out, batch, side_by_side, device)
+    # Other networks of this task find warps that change from frame to frame, too.
+    finds_lenses = any(isinstance(part, LensEncoder) for part in loaded.model.modules())
+    return _Job(restorer, restorer, cfg.pool == "auto" and finds_lenses, source, out, batch, side_by_side, device)
 
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
@@ -330,6 +379,8 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
     target = job.target(file)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
+        if job.pools_videos:
+            job = job.with_one_lens([file], target.with_suffix(".camera.yaml"))
         with replace_file(target, alone=True) as path:
             return convert_video(file, path, change=change)
     except UnreadableImageError as error:

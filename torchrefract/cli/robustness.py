@@ -22,13 +22,14 @@ import torchrefract
 from torchrefract import random
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive, first_names
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import read_camera
 from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
+from torchrefract.cli.place import read_place
 from torchrefract.cli.robustness_scenes import describe_scenes, make_scenes
 from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_scores, read_base, stored_scores
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, read_image
+from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_frame_of_camera, read_image
+from torchrefract.data.label_boxes import boxes_of_coco, boxes_of_yolo
 from torchrefract.data.label_files import (
     CocoLabels,
     LabelFolder,
@@ -36,7 +37,6 @@ from torchrefract.data.label_files import (
     PictureLabels,
     YoloFile,
     read_labels,
-    yolo_rows,
 )
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
@@ -92,8 +92,7 @@ class _Folder(NamedTuple):
                 self.skipped.append(str(error))
                 print(f"skipped: {error}", file=sys.stderr)
                 continue
-            if self.camera:
-                _check_shape(self.camera, name, image)
+            check_frame_of_camera(self.camera, name, height=image.shape[1], width=image.shape[2])
             with naming("labels"):
                 target = None if self.labels is None else _target(self.labels.of(name), image)
             yield name, image.to(self.device), target
@@ -249,23 +248,6 @@ def _metric(cfg: DictConfig, path: Path) -> str:
     return f"agreement ({name})" if cfg.labels is None else name
 
 
-def _place(cfg: DictConfig) -> dict[str, Any]:
-    """Return the arguments of all scenes that tell of the camera and the horizon, if they are given."""
-    place = {}
-    if cfg.camera is not None:
-        with naming("camera"):
-            place["camera"] = read_camera(Path(str(cfg.camera)).expanduser())
-    if cfg.horizon is not None:
-        with naming("horizon"):
-            place["horizon"] = check_number("horizon", cfg.horizon, low=-10, high=10)  # as the effects
-    return place
-
-
-def _check_shape(camera: Camera, name: str, image: Tensor) -> None:
-    try:
-        camera.resized(width=image.shape[2], height=image.shape[1])
-    except ValueError as error:
-        raise UsageError(f"camera must be that of all pictures, got {name}: {error}") from error
 
 
 def _folder(cfg: DictConfig) -> _Folder:
@@ -289,7 +271,7 @@ def _folder(cfg: DictConfig) -> _Folder:
         with naming("depth_scale"):
             depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths, [], _place(cfg), find_device(str(cfg.device)))
+    return _Folder(path, names, labels, depths, [], read_place(cfg), find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
@@ -301,14 +283,7 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
             pixels = np.array(picture)
             return tv_tensors.Mask(pixels.astype(np.int32) if pixels.dtype == np.uint16 else pixels)
     if isinstance(labels, YoloFile):
-        scale = np.array([size[1], size[0]])
-        rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(content, labels.path)]
-        # The center and size of a box, or the corners of a polygon.
-        boxes = [
-            [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
-            for _, at in rows
-        ]
-        classes = [name for name, _ in rows]
+        boxes, classes = boxes_of_yolo(content, labels, size)
     else:
         annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
         for annotation in annotations:
@@ -317,11 +292,10 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
                     "labels must have a bbox and a category_id that is a whole number in each annotation, got "
                     f"{first_names([str(name) for name in annotation])} in annotation {annotation.get('id')}"
                 )
-        corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4))
-        boxes = np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1).tolist()
+        boxes = boxes_of_coco(annotations)
         classes = [annotation["category_id"] for annotation in annotations]
     options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
-    boxes = tv_tensors.BoundingBoxes(torch.tensor(boxes, dtype=torch.float32).view(-1, 4), **options)
+    boxes = tv_tensors.BoundingBoxes(torch.from_numpy(boxes).float(), **options)
     return {"boxes": boxes, "labels": torch.tensor(classes, dtype=torch.int64)}
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -9,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import is_remote, local_file, relative_name, replace_file, sizes_in_store
 from torchrefract._validation import UsageError
-from torchrefract.data.images import fit, image_size
+from torchrefract.data.images import fit, image_size, local_copy
 from torchrefract.fields.depth import check_depth
 
 STEP = 1 / 256  # m, of a level of a PNG
@@ -25,7 +26,7 @@ class DepthFolder:
 
     The map of a picture a/b.jpg is a/b.png or a/b.npy, that of frame 7 of a video a/c.mp4 is a/c.mp4/000007.png.
 
-    root: the folder.
+    root: the folder, or one in a store.
     scale: m, of a level of a PNG.
     """
 
@@ -36,8 +37,26 @@ class DepthFolder:
         """Return the path of the map of a picture, or of a frame of a video, by its name relative to the frames."""
         stem = PurePosixPath(name)
         place = stem / f"{frame:06d}" if frame is not None else stem.with_suffix("")
-        paths = [self.root / f"{place}{suffix}" for suffix in _SUFFIXES]
-        return next((path for path in paths if path.is_file()), paths[0])
+        names = [f"{place}{suffix}" for suffix in _SUFFIXES]
+        return self.root / next((name for name in names if self._exists(name)), names[0])
+
+    def has(self, name: str, frame: int | None = None) -> bool:
+        """Return True if the map of a frame exists; in a store, if it existed when the first map was looked for."""
+        return self._exists(relative_name(self.path(name, frame), self.root))
+
+    def size_bytes(self, path: Path) -> int:
+        """Return the size of the file of an existing map."""
+        return path.stat().st_size if self._stored is None else self._stored[relative_name(path, self.root)]
+
+    def _exists(self, name: str) -> bool:
+        return (self.root / name).is_file() if self._stored is None else name in self._stored
+
+    @cached_property
+    def _stored(self) -> dict[str, int] | None:
+        """The maps in a store by their names, which are listed once; None for a folder on this machine."""
+        if not is_remote(self.root):
+            return None
+        return sizes_in_store(self.root) if self.root.exists() else {}
 
     def check(self, frames: Iterable[tuple[str, int | None]], *, exist: bool = True) -> None:
         """Raise UsageError if two frames, by name and number, share a map or, with `exist`, if one has none."""
@@ -54,7 +73,7 @@ class DepthFolder:
     def find(self, name: str, frame: int | None = None) -> Path:
         """Return the path of an existing map; raise UsageError if there is none."""
         path = self.path(name, frame)
-        if not path.is_file():
+        if not self.has(name, frame):
             raise UsageError(
                 f"depth must be a folder with a map for each frame, got none for {name} in {self.root} ({path} is "
                 "missing; python -m torchrefract.estimate_depth writes maps)"
@@ -134,8 +153,9 @@ def crop_depth(
 
 
 def _read_png(path: Path) -> np.ndarray:
-    image_size(path)  # raises UnreadableImageError
-    steps = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    with local_copy(path) as copy:
+        image_size(copy)  # raises UnreadableImageError
+        steps = cv2.imdecode(np.fromfile(copy, np.uint8), cv2.IMREAD_UNCHANGED)
     if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
         raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
     return steps
@@ -143,7 +163,8 @@ def _read_png(path: Path) -> np.ndarray:
 
 def _read_npy(path: Path) -> np.ndarray:
     try:
-        value = np.load(path, allow_pickle=False)
+        with local_file(path) as copy:
+            value = np.load(copy, allow_pickle=False)
     except OSError as error:
         raise UsageError(
             f"depth must be a file that can be read, got {path} ({error.strerror or 'damaged'})"

@@ -8,7 +8,6 @@ import os
 import posixpath
 import re
 import stat
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +17,8 @@ from typing import NamedTuple, NoReturn
 import torch
 from torch.utils.data import Dataset
 
-from torchrefract._validation import check_choice, check_number, check_size, first_names
+from torchrefract._io import as_path, is_remote, relative_name, sizes_in_store
+from torchrefract._validation import check_choice, check_number, check_size, first_names, warn
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image, warn_of_unread
 from torchrefract.random import key_of
@@ -27,6 +27,7 @@ from torchrefract.types import Frame
 _SPLITS = {"train": "train", "val": "val", "valid": "val", "validation": "val"}  # folder names
 _UNNAMED = "."  # the drive of frames in the root itself, or with bare numbers as names
 _MAX_UNREADABLE = 0.1  # share of the frames
+_REQUESTS = 32  # to a store at a time
 _FEW = 3  # frames, which may be one of each drive
 _DATE = re.compile(r"(?:^|.*?[^0-9])(?:19|20)\d\d[-_.]?\d\d[-_.]?\d\d(?=[-_. T]?\d\d[-_.:]?\d\d[-_.:]?\d\d$)")
 _NUMBERED = re.compile(r"\d[A-Za-z]?$")
@@ -67,7 +68,7 @@ class FrameFolder(Dataset[Frame]):
     keeps its corruption if other frames are added or removed.
 
     Args:
-        root: the folder.
+        root: the folder, or its address in a store.
         size: (height, width), px.
         split: "all", "train" or "val".
         drive_by: "auto", "folder" or "prefix".
@@ -92,8 +93,8 @@ class FrameFolder(Dataset[Frame]):
         seed: int = 0,
         depth: str | Path | None = None,
     ):
-        self.root = Path(root).expanduser()
-        self.depth = None if depth is None else DepthFolder(Path(depth).expanduser())
+        self.root = as_path(root)
+        self.depth = None if depth is None else DepthFolder(as_path(depth))
         self.size = check_size("size", size)
         check_choice("split", split, ("all", "train", "val"))
         check_choice("drive_by", drive_by, ("auto", "folder", "prefix"))
@@ -101,7 +102,7 @@ class FrameFolder(Dataset[Frame]):
             raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames, self.skipped = assign_frames(self.root, size=self.size, split=split, **options)
-        self.paths = [self.root / frame.path for frame in frames]
+        self.names = [frame.path for frame in frames]
         self.drive_names = [frame.drive for frame in frames]
         self.drives = sorted(set(self.drive_names))
         self.keys = [key_of(frame.path) for frame in frames]
@@ -109,13 +110,18 @@ class FrameFolder(Dataset[Frame]):
             self.depth.check((frame.path, None) for frame in frames)
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.names)
+
+    @property
+    def paths(self) -> list[Path]:
+        """The paths of the frames."""
+        return [self.root / name for name in self.names]
 
     def __getitem__(self, index: int) -> Frame:
         """Read a frame: image (3, h, w), key (), and its depth (1, h, w), m, or an empty one (0,)."""
-        image, depth = read_image(self.paths[index]), torch.empty(0, dtype=torch.float32, device="cpu")
+        name = self.names[index]
+        image, depth = read_image(self.root / name), torch.empty(0, dtype=torch.float32, device="cpu")
         if self.depth is not None:
-            name = self.paths[index].relative_to(self.root).as_posix()
             depth = self.depth.read(name, frame_size=(image.shape[1], image.shape[2]), size=self.size)
         return Frame(fit(image, self.size), torch.tensor(self.keys[index], device="cpu"), depth)
 
@@ -185,6 +191,11 @@ def name_prefix(stem: str) -> str:
 
 def _find_files(root: Path) -> list[str]:
     """List the files of a root: sorted paths relative to it, with forward slashes."""
+    if is_remote(root):  # which has no folders without files
+        if root.is_file() or not root.exists():
+            problem = "is a file" if root.is_file() else "does not exist"
+            raise FileNotFoundError(f"root must be a folder of frames, got {root}, which {problem}")
+        return sorted(list_names(root))
     try:
         is_folder = stat.S_ISDIR(root.stat().st_mode)
     except PermissionError as error:
@@ -215,6 +226,9 @@ def list_files(root: Path) -> Iterator[Path]:
 
 def list_names(root: Path) -> Iterator[str]:
     """Yield the names of the files of `list_files` relative to the root, with forward slashes."""
+    if is_remote(root):
+        yield from sizes_in_store(root)
+        return
     visited = set()
     for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_raise_permission_error):
         status = os.stat(folder)
@@ -252,7 +266,7 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     if shared:
         names = first_names(shared)
         message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
@@ -284,7 +298,7 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
             f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
             "train and val share drives; put each drive in a sub-folder of its own"
         )
-        warnings.warn(message, stacklevel=5)
+        warn(message)
     val, missing = set(), val_share * len(drive_of)
     order = sorted(frames, key=lambda drive: key_of(f"{seed}/{drive}"))
     for drive in order:
@@ -297,18 +311,18 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
 
 def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[set[str], list[tuple[Path, str]]]:
     """Return the readable paths, and the unreadable ones with the reasons."""
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(_REQUESTS if is_remote(root) else None) as pool:
         results = list(pool.map(_size_or_reason, [root / path for path in paths]))
     skipped = [(root / path, result) for path, result in zip(paths, results, strict=True) if isinstance(result, str)]
     if skipped:
-        examples = first_names([f"{path.relative_to(root).as_posix()} {reason}" for path, reason in skipped])
+        examples = first_names([f"{relative_name(path, root)} {reason}" for path, reason in skipped])
         if len(skipped) > _MAX_UNREADABLE * len(paths):
             raise ValueError(
                 f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
                 f"{examples}; remove them or copy them again"
             )
         message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
-        warnings.warn(message, stacklevel=4)
+        warn(message)
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:

@@ -7,13 +7,12 @@ if it is complete: if it has the end marker of JPEG and PNG, or the length that 
 import io
 import os
 import stat
-import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -21,9 +20,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchrefract._io import is_remote, read_bytes, retried
+from torchrefract._io import is_remote, local_file, read_bytes, retried, store_of
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract._validation import check_size, check_tensor
+from torchrefract._validation import UsageError, check_size, check_tensor, warn
+from torchrefract.cameras.camera import Camera
 from torchrefract.data.jpeg import lacks_pixel_data
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
@@ -159,7 +159,8 @@ def image_header(path: str | Path) -> ImageHeader:
         UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
             `read_image` alone.
     """
-    with opened(path) as stream:
+    # In a store, one request for the file is faster than several for its parts.
+    with io.BytesIO(read_file(path)) if is_remote(path) else opened(path) as stream:
         length = stream.seek(0, os.SEEK_END)
         stream.seek(0)
         _check_complete(path, stream, length)
@@ -175,7 +176,7 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
     if is_remote(path):
         store = cast(Path, path)
         try:
-            stream = cast(BinaryIO, retried(lambda: store.open("rb"), store))
+            stream = cast(BinaryIO, retried(lambda: store_of(store).open(cast(Any, store).path, "rb"), store))
         except OSError as error:
             raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
         with stream:
@@ -189,6 +190,17 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
     except OSError as error:
         raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+@contextmanager
+def local_copy(path: Path) -> Iterator[Path]:
+    """Yield a path on this machine with the content of a file, as `local_file` does; errors are those of `opened`."""
+    with ExitStack() as stack:
+        try:
+            copy = stack.enter_context(local_file(path))
+        except OSError as error:
+            raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+        yield copy
 
 
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
@@ -205,10 +217,9 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
 def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:
     """Warn of pictures and videos among the files of a folder whose format is not read."""
     if unread := [name for name in names if name.lower().endswith(_UNREAD)]:
-        warnings.warn(
+        warn(
             f"{source} holds {len(unread)} pictures or videos in formats that are not read, such as {unread[0]}; they "
-            "are left out: convert them to PNG or MP4",
-            stacklevel=3,
+            "are left out: convert them to PNG or MP4"
         )
 
 
@@ -259,9 +270,24 @@ def crop_center(maps: Tensor, size: Sequence[int]) -> Tensor:
     (height, width), (H, W) = size, maps.shape[1:]
     if height > H or width > W:
         raise ValueError(f"image must be at least size = {height}x{width} (height x width), got {H}x{W}")
-    crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
-    top, left = (H - crop_height) // 2, (W - crop_width) // 2
+    top, left, crop_height, crop_width = center_crop((H, W), size)
     return maps[:, top : top + crop_height, left : left + crop_width]
+
+
+def check_frame_of_camera(camera: Camera | None, name: str, *, height: int, width: int) -> None:
+    """Raise UsageError if a frame of a file has another shape than the frames of the camera."""
+    try:
+        if camera is not None:
+            camera.resized(width=width, height=height)
+    except ValueError as error:
+        raise UsageError(f"camera must be that of all frames, got {name}: {error}") from error
+
+
+def center_crop(frame_size: Sequence[int], size: Sequence[int]) -> tuple[int, int, int, int]:
+    """Return (top, left, height, width), px, of the center of a frame (H, W) of the aspect ratio of `size` = (h, w)."""
+    (H, W), (height, width) = frame_size, size
+    crop_height, crop_width = min(H, round(W * height / width)), min(W, round(H * width / height))
+    return (H - crop_height) // 2, (W - crop_width) // 2, crop_height, crop_width
 
 
 def reduce_by_area(maps: Tensor, size: Sequence[int]) -> Tensor:
@@ -311,19 +337,14 @@ def _late_exif(head: bytes, stream: BinaryIO) -> bytes:
 def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
     mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
-
-    def decode(data: bytes) -> np.ndarray | None:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), mode)
-
     try:
         with _silent_opencv():
-            pixels = decode(data)
-            is_partial = data.startswith(_JPEG) and pixels is not None and lacks_pixel_data(data, pixels, decode)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error as error:
         raise UnreadableImageError(f"{path} cannot be decoded ({error.err})") from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(f"{path} is damaged: its pixels cannot be decoded")
-    if is_partial:
+    if data.startswith(_JPEG) and lacks_pixel_data(data, pixels):
         raise UnreadableImageError(f"{path} is damaged: a part of its pixels is missing")
     return pixels
 

@@ -6,7 +6,6 @@ Boxes and polygons of COCO and YOLO count from the edge of the first pixel, keyp
 import hashlib
 import io
 import json
-import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
@@ -20,22 +19,20 @@ from PIL import Image
 from torch import Tensor
 
 from torchrefract._validation import UsageError, first_names
+from torchrefract.data.coco import Annotation, decompressed, problem_of
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import image_header, opened
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.plain_values import names_positions
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
 from torchrefract.labels.polygons import polygon_area, warp_polygons
-
-Annotation = dict[str, Any]  # of COCO
 
 _SUFFIXES = (".txt", ".png")  # of YOLO and masks
 _SIMPLIFICATION_PX = 0.02  # largest distance between a warped outline and the polygon that is written
 _DIGITS = 3  # of coordinates in a COCO JSON, px
+_MIN_POSE = 7  # numbers of a box and a keypoint of YOLO
 _UNIT_BOX = (0.0, 0.0, 1.0, 1.0)
 _FARTHEST_SHARE = 1.0  # of the frame, outside of which numbers of a YOLO file are those of another format
-_GEOMETRY = ("bbox", "segmentation", "keypoints")  # entries of an annotation that move
 
 
 class MovedLabels(NamedTuple):
@@ -244,10 +241,15 @@ def _read_coco(path: Path) -> CocoLabels:
             f"which {path} does not list; remove them, or add the images"
         )
     for annotation in document["annotations"]:
-        if problem := _problem(annotation):
+        if problem := problem_of(annotation):
             raise UsageError(
                 f"labels must be a valid COCO JSON, got {path}, whose annotation {annotation.get('id')} {problem}"
             )
+    boxes = [annotation["bbox"] for annotation in document["annotations"] if annotation.get("bbox")]
+    if boxes and max(map(max, boxes)) <= 1:
+        raise UsageError(
+            f"labels must have boxes in px, got {path} with shares of the frame; multiply them by its sides"
+        )
     return CocoLabels(path, document, images, annotations)
 
 
@@ -268,48 +270,6 @@ def check_named(others: Collection[str], path: Path) -> None:
             f"labels must name pictures of source, got {first_names(sorted(others))} in {path}, which source does not "
             "hold; give the folder that these names are relative to, or remove them"
         )
-
-
-def _problem(annotation: Annotation) -> str:
-    """Return what is wrong with an annotation; empty if it can be moved."""
-    box, keypoints = annotation.get("bbox"), annotation.get("keypoints")
-    if box and not (_are_numbers(box) and len(box) == 4 and min(box[2:]) >= 0):
-        return "has a bbox that is not x, y, width, height"
-    if keypoints and not (_are_numbers(keypoints) and len(keypoints) % 3 == 0):
-        return "has keypoints that are not x, y, visibility of each"
-    if keypoints and not {*keypoints[2::3]} <= {0, 1, 2}:
-        return "has keypoints whose visibility is not 0, 1 or 2"
-    return _problem_of_segmentation(annotation.get("segmentation")) or _problem_of_others(annotation)
-
-
-def _problem_of_segmentation(parts: Any) -> str:
-    if not parts:
-        return ""
-    if not isinstance(parts, dict):
-        are_polygons = isinstance(parts, list) and all(
-            _are_numbers(part) and len(part) > 5 and len(part) % 2 == 0 for part in parts
-        )
-        return "" if are_polygons else "has a segmentation that is not lists of x, y of three or more corners"
-    if not parts.keys() >= {"counts", "size"}:
-        return "has a run-length code without counts and size"
-    if isinstance(parts["counts"], list):
-        is_mask = _is_mask_code(parts["counts"], parts["size"])
-        return "" if is_mask else "has a run-length code whose counts do not add up to the pixels of its size"
-    return "" if _decompressed(parts) is not None else "has a run-length code with counts that cannot be decoded"
-
-
-def _problem_of_others(annotation: Annotation) -> str:
-    for name, value in annotation.items():
-        if name not in _GEOMETRY and isinstance(value, list | dict) and value and names_positions(name):
-            return f"has {name}, positions that would stay where they are; remove them, or state them as bbox"
-    attributes = annotation.get("attributes")
-    if isinstance(attributes, dict) and (angle := attributes.get("rotation")):
-        return f"has a box that is turned by {angle} degrees; state its corners as segmentation"
-    return "has segments_info of panoptic labels, which cannot be moved" if "segments_info" in annotation else ""
-
-
-def _are_numbers(values: Any) -> bool:
-    return isinstance(values, list) and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
 
 
 def _moved_annotations(annotations: Sequence[Annotation], flow: Tensor) -> Iterator[Annotation | None]:
@@ -384,34 +344,12 @@ def _moved_run_lengths(code: Mapping[str, Any], flow: Tensor) -> tuple[dict[str,
         flat = np.repeat(np.arange(len(code["counts"])) % 2, code["counts"]).astype(np.uint8)
         mask = flat.reshape(width, height).T
     else:
-        mask = cast(np.ndarray, _decompressed(code))  # checked when the JSON was read
+        mask = cast(np.ndarray, decompressed(code))  # checked when the JSON was read
     moved = warp_mask(torch.from_numpy(np.ascontiguousarray(mask))[None], flow)[0].numpy()
     columns = np.concatenate([[0], moved.T.ravel()])  # codes begin with a run of zeros, which may be empty
     ends = np.flatnonzero(np.diff(columns)).tolist()
     counts = np.diff([0, *ends, height * width]).tolist()
     return {"size": [height, width], "counts": counts}, int(moved.sum())
-
-
-def _is_mask_code(counts: Sequence[Any], size: Any) -> bool:
-    """Return True if the runs of a code are those of a mask of its size."""
-    are_counts = all(isinstance(count, int) and count >= 0 for count in counts)
-    return are_counts and _are_numbers(size) and len(size) == 2 and sum(counts) == math.prod(size)
-
-
-def _decompressed(code: Mapping[str, Any]) -> np.ndarray | None:
-    """Decode a compressed run-length code into a mask (H, W), uint8; return None for an invalid one."""
-    try:
-        from pycocotools import mask  # noqa: PLC0415 - only these codes need it
-    except ImportError as error:
-        raise UsageError(
-            "labels must have uncompressed run-length codes (counts as a list) unless pycocotools is installed: pip "
-            "install pycocotools"
-        ) from error
-    decode: Any = mask.decode  # its types know compressed codes as bytes only
-    try:
-        return decode(code)
-    except (ValueError, TypeError, LookupError):
-        return None
 
 
 def _rounded(values: Iterable[float]) -> list[float]:
@@ -429,11 +367,15 @@ def yolo_rows(data: bytes, path: Path) -> list[tuple[str, list[float]]]:
 
 def _yolo_row(line: bytes, place: str) -> tuple[str, list[float]]:
     """Return the class and the numbers of a line of a YOLO file."""
-    label, *words = line.decode(errors="replace").split()
+    label, *words = line.decode("utf-8-sig", errors="replace").split()
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
+    if _are_keypoints(numbers):
+        raise ValueError(
+            f"{place}, must be a box or a polygon, got keypoints x y visibility after a box; give them as a COCO JSON"
+        )
     is_form = label.isdecimal() and len(numbers) in (4, *range(6, len(numbers) + 1, 2))
     if not is_form or not all(-_FARTHEST_SHARE <= number <= 1 + _FARTHEST_SHARE for number in numbers):
         got = " ".join([label, *words])[:80]
@@ -442,3 +384,12 @@ def _yolo_row(line: bytes, place: str) -> tuple[str, list[float]]:
             f"got {got}"
         )
     return label, numbers
+
+
+def _are_keypoints(numbers: list[float]) -> bool:
+    """Return True for x y w h of a box and x y visibility of keypoints, the visible ones of which lie near the box."""
+    if len(numbers) < _MIN_POSE or len(numbers) % 3 != 1 or not {*numbers[6::3]} <= {0, 1, 2}:
+        return False
+    x, y, width, height = numbers[:4]
+    keypoints = zip(numbers[4::3], numbers[5::3], numbers[6::3], strict=True)
+    return all(v == 0 or (abs(a - x) <= width and abs(b - y) <= height) for a, b, v in keypoints)

@@ -5,7 +5,6 @@ display matrix) turns them for display. Readers take `upright`: True for the dis
 sensor. Writers keep the tag of a frame of the sensor, so that viewers show every output upright.
 """
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +13,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from torchrefract._validation import UsageError
+from torchrefract._io import is_remote
+from torchrefract._validation import UsageError, warn
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
@@ -87,7 +87,7 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
-    names = Counter(str(output_name(file)) for file in files)
+    names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
     return files
@@ -98,6 +98,8 @@ def check_output_folder(out: Path, source: Path, *, deep: bool = False, name: st
 
     `name` is the option of `source`.
     """
+    if is_remote(out) != is_remote(source):
+        return
     folder = (source if source.is_dir() else source.parent).resolve()
     if out.resolve() == folder:
         raise UsageError(f"out must be another folder than that of {name}, got {out}")
@@ -118,10 +120,10 @@ def output_name(file: Path) -> Path:
 def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
     """Return True if the output of a file exists and has its number of frames (video) or its sides (picture).
 
-    The output of a picture may hold several, side by side.
+    The output of a picture may hold several, side by side. A file of a store is not read for it.
     """
-    if not target.is_file():
-        return False
+    if not target.is_file() or is_remote(file):
+        return target.is_file()
     if is_video(file):
         # The header of a trimmed video counts frames that are not shown.
         return (num := video_info(target)[0]) > 0 and num in (video_info(file)[0], count_frames(file))
@@ -176,7 +178,7 @@ def write_picture(image: Tensor, path: Path, *, source: Path, upright: bool = Tr
     options = _ENCODING.get(suffix, [])
     is_encoded, encoded = cv2.imencodeWithMetadata(path.suffix, pixels, [*kept], [*kept.values()], options)
     if not is_encoded and kept.pop(cv2.IMAGE_METADATA_ICCP, None) is not None:
-        warnings.warn(f"{source} has an invalid color profile, which is not kept", stacklevel=2)
+        warn(f"{source} has an invalid color profile, which is not kept")
         is_encoded, encoded = cv2.imencodeWithMetadata(path.suffix, pixels, [*kept], [*kept.values()], options)
     if not is_encoded:
         raise UsageError(f"{path} could not be written as {path.suffix}")

@@ -13,6 +13,7 @@ from pytorch_lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_collate
 
+from torchrefract._io import is_remote, sizes_in_store
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.pairs.dataset import PairedFolder
@@ -308,7 +309,8 @@ def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
     if isinstance(frames, FrameFolder):
         result |= {"root": str(frames.root), "drives": len(frames.drives)}
         result |= {} if frames.depth is None else {"depth": str(frames.depth.root)}
-        lines = (f"{path.relative_to(frames.root).as_posix()} {path.stat().st_size}" for path in frames.paths)
+        sizes = sizes_in_store(frames.root) if is_remote(frames.root) else {}
+        lines = (f"{name} {sizes.get(name) or (frames.root / name).stat().st_size}" for name in frames.names)
     elif isinstance(frames, PairedFolder):
         rows = list(frames.rows())
         result |= {"root": str(frames.root), "drives": len({row.drive for row in rows}), "license": _license(frames)}

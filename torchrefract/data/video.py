@@ -3,7 +3,6 @@
 import contextlib
 import io
 import math
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from torchrefract._io import is_remote
 from torchrefract._tensor import to_float
+from torchrefract._validation import warn
 from torchrefract.data.images import UnreadableImageError, opened
 
 _DEFAULT_RATE = Fraction(25)  # of a video whose header has no rate
@@ -211,23 +211,21 @@ def _decode(path: Path) -> Iterator[av.VideoFrame]:
                 for frame in packet.decode():
                     _check_turn(frame, path)
                     if not is_hdr and (is_hdr := frame.color_trc in _HDR):
-                        warnings.warn(
+                        warn(
                             f"{path} has a high dynamic range ({_HDR[frame.color_trc]}), whose values are used like "
                             "those of an ordinary video: colors are pale, and light in fog and glare does not add up. "
-                            "Convert it to BT.709 first, such as by the filters zscale and tonemap of ffmpeg",
-                            stacklevel=2,
+                            "Convert it to BT.709 first, such as by the filters zscale and tonemap of ffmpeg"
                         )
                     if not is_interlaced and (is_interlaced := frame.interlaced_frame):
-                        warnings.warn(
+                        warn(
                             f"{path} is interlaced: the rows of a frame are of two times. Deinterlace it first: "
-                            "ffmpeg -i INPUT -vf bwdif OUTPUT",
-                            stacklevel=2,
+                            "ffmpeg -i INPUT -vf bwdif OUTPUT"
                         )
                     yield frame
             except av.FFmpegError:
                 num_damaged += 1
     if num_damaged:
-        warnings.warn(f"{path} has {num_damaged} damaged frames, which are left out", stacklevel=2)
+        warn(f"{path} has {num_damaged} damaged frames, which are left out")
 
 
 def _packets(*streams: Stream) -> Iterator[Packet]:
@@ -236,7 +234,7 @@ def _packets(*streams: Stream) -> Iterator[Packet]:
     try:
         yield from container.demux(*streams)
     except av.FFmpegError as error:
-        warnings.warn(f"{container.name} is damaged and ends early ({error.strerror})", stacklevel=2)
+        warn(f"{container.name} is damaged and ends early ({error.strerror})")
 
 
 def _copy_packets(copies: dict[Stream, Stream]) -> Iterator[Packet]:

@@ -36,8 +36,10 @@ from torchrefract.effects.batch import (
     promote_params,
     to_batch,
 )
+from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.fields.depth import DepthSource, depth_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
+from torchrefract.labels.vehicles import LabeledBoxes, boxes_of_target
 from torchrefract.types import Degraded, Range
 from torchrefract.warping.grid import field_dtype
 
@@ -93,33 +95,48 @@ class Effect(nn.Module, ABC):
             image: as for the class, or a sample.
             target: any nesting of torchvision tv_tensors and plain values; see `warp_labels` for what moves and what
                 raises, and `labels_getter` for what is removed together with boxes. A batch of images takes a list of
-                targets. Photometric effects leave labels as they are.
+                targets. Photometric effects leave labels as they are; dust with `vehicle_labels` is thicker behind the
+                vehicles among the boxes.
 
         Returns:
             What was passed, in the same nesting, with the degraded image and the moved labels.
         """
         if target:
-            result, degraded = self._degrade_like(image)
+            result, degraded = self._degrade_like(image, target)
             return result, *self._move_labels(target, degraded.flow, (image, *target))
         if isinstance(image, Tensor):
-            result, degraded = self._degrade_like(image)
+            result, degraded = self._degrade_like(image, ())
             if degraded.has("flow"):
                 check_kornia_keys()
             return result
         leaves, spec = pytree.tree_flatten(image)
         place = _find_image(leaves)
-        result, degraded = self._degrade_like(leaves[place])
+        result, degraded = self._degrade_like(leaves[place], (image,))
         marker = torch.empty((), dtype=torch.float32, device="cpu")  # stands for the image, which is not a label
         (moved,) = self._move_labels(
             (pytree.tree_unflatten([*leaves[:place], marker, *leaves[place + 1 :]], spec),), degraded.flow, image
         )
         return pytree.tree_map(lambda leaf: result if leaf is marker else leaf, moved)
 
-    def _degrade_like(self, image: Any) -> tuple[Tensor, Degraded]:
+    def _degrade_like(self, image: Any, targets: tuple[Any, ...]) -> tuple[Tensor, Degraded]:
         """Return the degraded image in the torchvision type of the image, and with its maps."""
-        degraded = self.degrade(image)
+        boxes = self._boxes(image, targets) if targets and uses_boxes(self) else ()
+        if boxes:
+            self._check_values(image)
+            degraded = self.apply(image, with_vehicles(self, self.sample(image), boxes))
+        else:
+            degraded = self.degrade(image)
         is_tv = is_tv_tensor(image, "Image") or is_tv_tensor(image, "Video")
         return wrap_like(degraded.image, image) if is_tv else degraded.image, degraded
+
+    def _boxes(self, image: Any, targets: tuple[Any, ...]) -> list[LabeledBoxes]:
+        """Return the boxes in the target of each image; none for clips, whose boxes are not of one frame."""
+        if not isinstance(image, Tensor) or is_tv_tensor(image, "Video") or image.ndim not in (3, 4):
+            return []
+        if image.ndim == 3:
+            return [boxes_of_target(targets)]
+        is_of_each = all(type(target) in (list, tuple) and len(target) == len(image) for target in targets)
+        return [boxes_of_target(sample) for sample in zip(*targets, strict=True)] if is_of_each else []
 
     def _move_labels(self, targets: tuple[Any, ...], flow: Tensor | None, inputs: Any) -> tuple[Any, ...]:
         """Return the targets of an image, or of a batch of images, that moved along its flow."""

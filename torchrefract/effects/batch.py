@@ -5,7 +5,6 @@ of a clip keeps B rows until it meets one that is not.
 """
 
 import sys
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
-from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad, why_not_eager
+from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad, warn, why_not_eager
 from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.warping.grid import field_dtype
 
@@ -51,8 +50,13 @@ def check_image(image: Tensor) -> BatchShape:
 
     Raises:
         ValueError: another number of dimensions; no channel, no pixel or no frame.
-        TypeError: neither floating nor uint8.
+        TypeError: neither floating nor uint8; or `torch.jit.trace` runs.
     """
+    if torch.jit.is_tracing():
+        raise TypeError(
+            "image must be a tensor with values, got one of torch.jit.trace, which would repeat a single draw; use "
+            "torch.export.export or torch.compile"
+        )
     if is_foreign_image(image):
         raise TypeError(
             f"image must be a tensor, got {type(image).__module__}.{type(image).__name__}; convert it by "
@@ -79,10 +83,9 @@ def check_image(image: Tensor) -> BatchShape:
     if frames == 0:
         raise ValueError(f"image must have at least one frame in a clip, got {tuple(image.shape)}")
     if frames == 3 and image.shape[-3] > _MOST_CHANNELS and not torch.compiler.is_compiling():
-        warnings.warn(
+        warn(
             f"image of shape {tuple(image.shape)} is taken for clips of 3 frames with {image.shape[-3]} channels; use "
-            "image.movedim(-4, -3) if its channels are before its frames",
-            stacklevel=4,
+            "image.movedim(-4, -3) if its channels are before its frames"
         )
     return BatchShape(batch, frames, leading)
 

@@ -37,6 +37,9 @@ from torchrefract.fields.depth import DepthSource
 from torchrefract.fields.dust import descent_of_rows, mean_density, mean_wake_density
 from torchrefract.fields.fog_volume import ExtinctionField, mean_extinction_along_rays
 from torchrefract.fields.heterogeneous_fog import image_noise, normalize_weights, periods_in_frame
+from torchrefract.fields.night_glow import unclip_lamps
+from torchrefract.fields.srgb import luma
+from torchrefract.labels.vehicles import check_vehicle_labels
 from torchrefract.planning.photometric import (
     PhotometricPlan,
     PhotometricRequest,
@@ -58,6 +61,7 @@ _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
 _EVEN = 1e12  # m, a scale height at which the density is even
 _FARTHEST_PX = 1e5  # of a box
+_DARK_AIRLIGHT = 0.4  # luma, below which fog is that of the night
 
 
 class HeterogeneousFogParams(NamedTuple):
@@ -126,8 +130,11 @@ class HeterogeneousFog(PhotometricEffect):
             and multiplies that of the random field; V is the visibility on the road. None is an even density.
         wake_density: of the dust on the road behind a vehicle ahead, relative to the mean extinction, at least 0.
         wake_length: m, over which this dust falls to 1/e toward the camera. It is as wide and high as the vehicle, see
-            `mean_wake_density`, and is added to the fog where boxes are given:
+            `mean_wake_density`, and is added to the fog where boxes are given: by `vehicle_labels`, or by
             `effect.apply(image, effect.sample(image)._replace(vehicles=boxes))`. Without boxes there is none.
+        vehicle_labels: numbers or names of the classes whose boxes raise this dust where a target has boxes, as in
+            `effect(image, target)` and `degrade labels=...`; boxes without classes all do, those of clips do not. None
+            raises none.
         camera_height, horizon: m, of the camera above the road, and share of the height of the frame, from the top, at
             which the road vanishes; for a plume and vehicles, and the horizon for the sun.
         sunlight_range: share of direct sunlight in the airlight, within [0, 1]: it makes the fog brighter on the side
@@ -137,6 +144,9 @@ class HeterogeneousFog(PhotometricEffect):
             above the horizon, within [-10, 90].
         asymmetry: mean cosine of the angle by which the fog scatters light, in (-1, 1): 0.6 to 0.9 for thin haze and
             dust, less for fog, in which light is scattered many times.
+        lamp_luminance: in [1, 1e4], of lamps in fog at night, whose airlight is darker than 0.4: pixels that the camera
+            clipped, of stored values from 0.85 to 1, count as up to that many times white, see `unclip_lamps`, and stay
+            bright through fog that hides the rest. `remove_fog` does not undo them. Take linear light with it.
         decorrelation_range: frames, above 0 or inf, until k in the wind has the correlation 1/e with itself; one over
             it is uniform.
         tolerance: largest error of the image, levels of 1/255: octaves that are too faint, and fog or a contrast that
@@ -181,6 +191,8 @@ class HeterogeneousFog(PhotometricEffect):
         scale_height_range: Range | None = None,
         wake_density: float = 10.0,
         wake_length: float = 15.0,
+        lamp_luminance: float = 1.0,
+        vehicle_labels: Sequence[int | str] | None = None,
         camera_height: float = 1.3,
         horizon: float = 0.5,
         sunlight_range: Range | None = None,
@@ -220,6 +232,8 @@ class HeterogeneousFog(PhotometricEffect):
             self.scale_height_range = check_range("scale_height_range", scale_height_range, low=low, high=high)
         self.wake_density = check_number("wake_density", wake_density, low=0.0, high=1e6)
         self.wake_length = check_number("wake_length", wake_length, low=1e-3, high=1e6)
+        self.lamp_luminance = check_number("lamp_luminance", lamp_luminance, low=1.0, high=1e4)
+        self.vehicle_labels = check_vehicle_labels(vehicle_labels)
         self.camera_height = check_positive("camera_height", camera_height)
         self.horizon = check_number("horizon", horizon, low=-10.0, high=10.0)
         self.sunlight_range = (
@@ -349,7 +363,19 @@ class HeterogeneousFog(PhotometricEffect):
         if params.sun is not None and self.sunlight_range is not None:
             lit = params._replace(airlight=finite_or(params.airlight.to(field_dtype(image.dtype)), 0.0))
             airlight = expand_batch(self.airlight_map(lit, *image.shape[2:]), image.shape[0])
-        return self.medium.blend(image, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)
+        has_lamps = self.lamp_luminance > 1 and not plan.is_identity
+        source = self._unclip_lamps(image, params) if has_lamps else image
+        rendered = self.medium.blend(source, params, distance, k, is_visible=not plan.is_identity, airlight=airlight)
+        if not has_lamps:
+            return rendered
+        color = params.airlight.to(image.dtype)[:, :, None, None] if airlight is None else airlight
+        brightest = torch.maximum(image, expand_batch(finite_or(color, 0.0), len(image)))
+        return rendered._replace(image=torch.minimum(rendered.image, brightest))
+
+    def _unclip_lamps(self, image: Tensor, params: HeterogeneousFogParams) -> Tensor:
+        """Return images in which lamps are brighter than white, in fog that is dark."""
+        is_dark = luma(finite_or(params.airlight, 0.0).to(image.dtype)[:, :, None, None]) < _DARK_AIRLIGHT
+        return unclip_lamps(image, torch.where(expand_batch(is_dark, len(image)), self.lamp_luminance, 1.0))
 
     def _extinction(
         self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan

@@ -1,6 +1,5 @@
 """The lens of a cheap dashcam."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
@@ -19,6 +18,7 @@ from torchrefract._validation import (
     eager_bool,
     eager_values,
     requires_grad,
+    warn,
 )
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, used_terms
 from torchrefract.cameras.camera import Camera
@@ -359,7 +359,7 @@ class LensDistortion(WarpEffect):
             sample = folds.index(True)
             k1, k2 = params.coefficients[sample, :2].tolist()
             raise ValueError(f"coefficients: {rule}, got k1 = {k1:g} and k2 = {k2:g} in sample {sample}")
-        warnings.warn(f"{rule}: pixels beyond have no preimage and are padded, not valid", stacklevel=2)
+        warn(f"{rule}: pixels beyond have no preimage and are padded, not valid")
 
 
 def check_lens(

@@ -29,6 +29,7 @@ from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth
 from torchrefract.fields.physical_turbulence import (
     Air,
     domain_size,
+    fried_parameter,
     height_gain,
     layer_gradients,
     layer_shares,
@@ -78,8 +79,8 @@ class PhysicalTurbulence(WarpEffect):
 
     Sizes: with f = 1400 px and an aperture of 2 mm, Cn2 = 1e-12 moves what is 200 m away by 0.05 px, and 1e-11 what is
     300 m away by 0.19 px. Displacements of 0.5 to 3 px are those of telephoto lenses; `Turbulence` exaggerates them for
-    others, see its `equivalent_cn2`. The blur of short exposures is left out: it is invisible where the aperture is
-    smaller than Fried's parameter, as in these cameras.
+    others, see its `equivalent_cn2`. The blur of short exposures is left out. It is invisible where the aperture D is
+    smaller than Fried's parameter r0: at 2 mm up to a Cn2 of 1e-12 over 1 km. The plan states D / r0 above 1.
 
     Args:
         cn2_range: m^(-2/3), at the height of the camera; its root is drawn uniformly. 1e-14 is weak, 1e-12 a hot day.
@@ -198,7 +199,15 @@ class PhysicalTurbulence(WarpEffect):
     def error_model(self) -> "_TurbulenceBounds":
         """Return the largest displacement of the ranges."""
         gain = 1.0 if self.height is None else max(self._layers.gains)
-        return _TurbulenceBounds(self._tilts, gain, self.camera, self.focal)
+        return _TurbulenceBounds(self._tilts, gain, self.camera, self.focal, self.blur_ratio)
+
+    @property
+    def blur_ratio(self) -> float:
+        """Return D / r0 at the reach in the strongest air of the range, by `fried_parameter`.
+
+        Above 1 a short exposure would be blurred more than the aperture blurs it; this blur is left out.
+        """
+        return self.aperture / fried_parameter(self.cn2_range[1], self.reach)
 
     def equivalent_amplitude(self, width: int, *, distance: float | None = None) -> Range:
         """Return the displacement, px, of what is a distance away in frames of a width, for the ends of `cn2_range`.
@@ -238,13 +247,14 @@ class _TurbulenceBounds:
 
     tilt: microradians, from the reach on a level path.
     gain: the largest gain by height.
-    camera, focal: as for `PhysicalTurbulence`.
+    camera, focal, blur_ratio: as for `PhysicalTurbulence`.
     """
 
     tilt: Range
     gain: float
     camera: Camera | None
     focal: float
+    blur_ratio: float
 
     is_random = True
 
@@ -256,7 +266,10 @@ class _TurbulenceBounds:
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave nothing out."""
-        return Simplification(0.0, can_interpolate=False, why="each pixel has a ray of its own")
+        why = "each pixel has a ray of its own"
+        if self.blur_ratio > 1:
+            why += f"; the blur of short exposures is left out, D / r0 is up to {self.blur_ratio:.1f}"
+        return Simplification(0.0, can_interpolate=False, why=why)
 
     def contains(self, params: PhysicalTurbulenceParams) -> Tensor:
         """Return (), bool: the tilt lies in the range, up to rounding."""

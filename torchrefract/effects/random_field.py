@@ -1,6 +1,5 @@
 """Code that random fields share: checks and draws of parameters that move and change over a clip."""
 
-import warnings
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torchrefract._validation import (
     eager_values,
     finite_or,
     requires_grad,
+    warn,
 )
 from torchrefract.effects.batch import LATEST_FRAME, check_shapes
 from torchrefract.fields.random_field import FieldParams, Motion
@@ -118,9 +118,8 @@ def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None
     applied = expand_batch(params.applied, len(clipped))
     share = max(eager_values(lambda: torch.where(applied, clipped, 0), of=clipped) or [0.0])
     if share > _MAX_CLIPPED:
-        warnings.warn(
+        warn(
             f"length must fit into a periodic domain of {size[0]} x {size[1]} px, the largest for this frame, got "
             f"{params.length.max().item():g} px: {share:.1%} of the spectrum is negative and was set to 0, and the "
-            "covariance is off by up to twice that. Lower length_range.",
-            stacklevel=2,
+            "covariance is off by up to twice that. Lower length_range."
         )

@@ -1,6 +1,5 @@
 """A frame of a calibrated camera as a pinhole would have shown it."""
 
-import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_choice, check_within, eager_bool
+from torchrefract._validation import check_choice, check_within, eager_bool, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.lens import check_lens, lens_in_px
@@ -145,9 +144,7 @@ class Rectification(WarpEffect):
 
         is_suspect = points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False
         if is_suspect and eager_bool(folds, of=params.applied):
-            warnings.warn(
-                "camera: the model folds back inside the frame: pixels beyond are padded, not valid", stacklevel=2
-            )
+            warn("camera: the model folds back inside the frame: pixels beyond are padded, not valid")
         return flow, exists
 
     def inverse_flow(self, params: RectificationParams, flow: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,6 @@
 """Turbulent air in front of the camera."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_choice, check_positive, eager_bool
+from torchrefract._validation import check_choice, check_positive, eager_bool, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import ParamsAtDepth, params_to
 from torchrefract.effects.batch_flow import everywhere
@@ -275,10 +274,9 @@ class Turbulence(WarpEffect):
             return (params.applied & (params.amplitude * gradient > _FOLDING_GRADIENT)).any()
 
         if eager_bool(folds, of=params.applied):
-            warnings.warn(
+            warn(
                 "Turbulence this strong folds the image; folded pixels are excluded from restore_valid. Lower "
-                "amplitude_range, or raise length_range or aperture_range.",
-                stacklevel=2,
+                "amplitude_range, or raise length_range or aperture_range."
             )
 
 

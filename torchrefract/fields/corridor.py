@@ -1,7 +1,6 @@
 """Depth of a road between walls, with the sky from the frame: a stand-in where no depth map is known."""
 
 import math
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import shareable
-from torchrefract._validation import check_number, check_positive
+from torchrefract._validation import check_number, check_positive, warn
 from torchrefract.fields.depth import GroundPlaneDepth
 from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
@@ -82,10 +81,9 @@ class CorridorDepth:
             UserWarning: once for each place in the code, that the depth is assumed.
         """
         if not torch.compiler.is_compiling():
-            warnings.warn(
+            warn(
                 "depth is that of a road between walls; pass depth=, a map in m or torchrefract.depth."
-                "from_transformers(...), for fog that knows what stands where",
-                stacklevel=2,
+                "from_transformers(...), for fog that knows what stands where"
             )
         height, width = image.shape[2:]
         dtype, device = field_dtype(image.dtype), image.device

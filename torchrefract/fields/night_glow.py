@@ -10,11 +10,13 @@ from torch import Tensor
 from torchrefract._tensor import exact_matmul, interpolate_channels, rows_at_once, without_autocast
 from torchrefract._validation import eager_bool, requires_grad
 from torchrefract.fields.exposure import finite_image
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
 _NODES = 320  # of the lattice along the longer side, on which light is spread
 _SMOOTHING = 0.6  # nodes, standard deviation; a lattice cannot hold the peak of the glow
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
 _THINNEST = 1e-6  # optical depth; the shape of the glow of thinner fog is that of this one
+_LAMP = 0.85  # stored value, from which a pixel may be a lamp
 _SMALLEST = 1e-30
 
 
@@ -51,6 +53,20 @@ def lamp_light(image: Tensor, threshold: float) -> Tensor:
         if eager_bool(lambda: light.isfinite().all(), of=light) is False:
             light = of_rows(finite_image(image))
     return (light / (1 - threshold) ** 2).clamp(max=1.0)
+
+
+def unclip_lamps(image: Tensor, luminance: float | Tensor) -> Tensor:
+    """Return stored values of the light before the camera clipped lamps, which may be above 1.
+
+        x (1 + (luminance - 1) w),  w = max(I - 0.85, 0)^2 / 0.15^2,  at most 1, of the brightest channel
+
+    Args:
+        image: (N, C, H, W), stored values, I, of the linear light x.
+        luminance: of a lamp of stored value 1, at least 1; a number or (N, 1, 1, 1).
+    """
+    excess = ((image.amax(dim=1, keepdim=True) - _LAMP) / (1 - _LAMP)).clamp(0, 1).square()
+    lit = linear_to_srgb(srgb_to_linear(image) * (1 + (luminance - 1) * excess))
+    return torch.where(excess > 0, lit, image)
 
 
 def lattice_stride(image: Tensor) -> int:

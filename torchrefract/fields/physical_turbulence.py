@@ -28,6 +28,8 @@ from torchrefract._validation import why_not_eager
 from torchrefract.fields.random_field import fast_size
 from torchrefract.random import white_noise
 
+GREEN = 550e-9  # m, wavelength of the light that counts most
+
 _RATIO = 3.0  # of the far ends of successive layers
 _HEIGHT_EXPONENT = -4 / 3  # of Cn2, by day
 _NEAREST = 1e-3  # of the reach
@@ -77,6 +79,25 @@ def tilt_variance(distance: float, air: Air) -> float:
         air: aperture and scales.
     """
     return 2 * math.pi * distance * _strength(air) / _exponent(air)
+
+
+def fried_parameter(cn2: float, distance: float, *, wavelength: float = GREEN) -> float:
+    """Return Fried's parameter of a level path with the same air everywhere, m; inf without turbulence.
+
+        r0 = (0.423 k^2 int_0^L Cn2 (1 - s/L)^(5/3) ds)^(-3/5) = (0.423 k^2 Cn2 L 3/8)^(-3/5),  k = 2 pi / wavelength
+
+    An aperture D blurs short exposures by diffraction alone while D / r0 is below about 1.
+
+    Args:
+        cn2: m^(-2/3), at least 0.
+        distance: m, L.
+        wavelength: m.
+
+    Source: Fried, "Optical resolution through a randomly inhomogeneous medium for very long and very short exposures",
+    JOSA 56 (1966), for a spherical wave.
+    """
+    strength = 0.423 * (2 * math.pi / wavelength) ** 2 * cn2 * distance * 3 / 8
+    return strength**-0.6 if strength > 0 else math.inf
 
 
 def layers_of(reach: float, count: int, air: Air) -> Layers:

@@ -22,7 +22,8 @@ _TYPES_BY_WORD = {
     **dict.fromkeys(("poly", "polygon", "polygons", "contour", "contours"), "Mask"),
     **dict.fromkeys(("kpt", "kpts", "landmark", "landmarks", "lane", "lanes", "polyline", "polylines"), "KeyPoints"),
 }
-_FORMATS = ("xyxy", "xywh", "cxcywh", "xyxyn", "xywhn", "d")  # words after the name, "d" of "box2d"
+# Words after the name: "d" of "box2d", "proj" of Omni3D's "bbox2D_proj".
+_FORMATS = ("xyxy", "xywh", "cxcywh", "xyxyn", "xywhn", "d", "proj", "trunc", "tight")
 _OF_SPACE = re.compile(r"3_?d$")  # boxes in meters do not move with the image
 _COUNTS = ("num", "n", "count")  # first words of names of counts
 _COORDINATES = re.compile(r"[xy]|[xy][1-4]|c[xy]|[xy]_?(min|max)|w|h|width|height|left|top|right|bottom")

@@ -7,7 +7,6 @@ import math
 import numbers
 import os
 import sys
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool
+from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool, warn
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.plain_values import check_moves, name_of
@@ -170,10 +169,9 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
         flags = cast(Tensor, warped[i].flags)
         for k in _rows_of_boxes(sample, paths, leaves, boxes, i, options.labels_getter):
             if options.labels_getter == "default" and _looks_like_camera_matrix(leaves[k]) and not flags.all():
-                warnings.warn(
+                warn(
                     f"target{pytree.keystr(paths[k])} has as many rows as there are boxes and lost those of removed "
-                    "boxes; if it is a matrix of the camera, say so in its name ('camera_...') or pass labels_getter",
-                    stacklevel=2,
+                    "boxes; if it is a matrix of the camera, say so in its name ('camera_...') or pass labels_getter"
                 )
             values[k] = _select(values[k], flags)
     return pytree.tree_unflatten(values, spec)
@@ -246,17 +244,17 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
     else:
-        corners = _convert(plain, boxes.format.name, "XYXY") - 0.5
+        corners = convert_boxes(plain, boxes.format.name, "XYXY") - 0.5
         limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
         warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
-        warped = _convert(warped + 0.5, "XYXY", boxes.format.name)
+        warped = convert_boxes(warped + 0.5, "XYXY", boxes.format.name)
     return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
 
 
 def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
-    corners = _convert(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
+    corners = convert_boxes(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
     outlines = warp_outlines(corners, flow[None], samples=_SAMPLES_PER_EDGE)
     axes = _box_axes(outlines.points, outlines.converged, corners)
     extent = outlines.extent(axes)
@@ -268,7 +266,7 @@ def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Option
     rectangle = torch.stack([x1, y1, x2, y1, x2, y2, x1, y2], dim=-1).unflatten(-1, (4, 2))
     # The transpose of a rotation is its inverse: back from coordinates along the axes.
     warped = (rectangle[..., None] * axes[:, :, None]).sum(dim=-2)
-    return _convert(warped[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
+    return convert_boxes(warped[0].flatten(1) + 0.5, "XYXYXYXY", form), keep[0]
 
 
 def _box_axes(points: Tensor, converged: Tensor, corners: Tensor) -> Tensor:
@@ -377,7 +375,8 @@ def _clear_visibility(values: list[Any], leaves: list[Any], siblings: dict[str, 
         values[k] = after if kind is Tensor else after.numpy() if kind is np.ndarray else kind(after.tolist())
 
 
-def _convert(boxes: Tensor, old: str, new: str) -> Tensor:
+def convert_boxes(boxes: Tensor, old: str, new: str) -> Tensor:
+    """Convert boxes between two formats of torchvision, by their names."""
     convert = importlib.import_module("torchvision.transforms.v2.functional").convert_bounding_box_format
     return convert(boxes, old_format=old, new_format=new)
 

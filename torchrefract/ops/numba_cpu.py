@@ -5,7 +5,6 @@ caches the machine code on disk.
 """
 
 import os
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import is_channels_last
+from torchrefract._validation import warn
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _SMALLEST_BAND = 1 << 14  # pixels that are worth a thread
@@ -59,11 +59,10 @@ def _optional(access: Callable[..., Any], storage: Any) -> Callable[..., Any]:
 
 @cache
 def _warn_of_cache(folder: str) -> None:
-    warnings.warn(
+    warn(
         f"numba cannot use its cache in {folder}, so each process compiles kernels again; free disk space, remove the "
         "folder, or set NUMBA_CACHE_DIR",
         RuntimeWarning,
-        stacklevel=2,
     )
 
 

@@ -171,20 +171,43 @@ def load_model(path: str | Path, *, changes: Mapping[str, Any] | None = None) ->
     return Loaded(model.eval(), name, str(checkpoint["task"]), _frame_size(data.get("size"), path), licenses)
 
 
-def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
+def load_weights(model: nn.Module, path: Path, *, task: str, config: Mapping[str, Any]) -> Any:
+    """Load the weights of a checkpoint into a model of the same network, and return the checkpoint's licenses.
+
+    Args:
+        model: of that network.
+        path: the checkpoint.
+        task: name of the task of the model.
+        config: configuration of the model, for messages.
+
+    Raises:
+        CheckpointError: see `read_checkpoint` and `check_fits`, whose messages name `init_from`.
+    """
+    checkpoint = read_checkpoint(path, task=task, argument="init_from")
+    check_fits(checkpoint, model, path, config=config, argument="init_from")
+    model.load_state_dict(checkpoint["state_dict"])
+    return checkpoint.get("licenses")
+
+
+def read_checkpoint(path: Path, *, task: str | None = None, argument: str = "ckpt_path") -> dict[str, Any]:
     """Read a checkpoint without running code from it; its task must be `task`, if that is given.
+
+    Args:
+        path: the file.
+        task: the name of the task that is expected; None allows any.
+        argument: the option that gave the path, for messages.
 
     Raises:
         CheckpointError: the file is missing, damaged, no checkpoint of torchrefract, or of another task.
     """
     if not path.is_file():
-        raise CheckpointError(f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {path}")
+        raise CheckpointError(f"{argument} must be a checkpoint file, such as <run>/last.ckpt, got {path}")
     try:
         with local_file(path) as file:
             checkpoint = read_weights(file) if path.suffix == WEIGHTS_SUFFIX else _read_archive(file)
     except Exception as error:  # zipfile, torch.load and safetensors raise many types for a damaged file
         raise CheckpointError(
-            f"ckpt_path must be an intact checkpoint, got {path}, which is damaged or another kind of file"
+            f"{argument} must be an intact checkpoint, got {path}, which is damaged or another kind of file"
         ) from error
     weights, name = (checkpoint.get(key) if isinstance(checkpoint, dict) else None for key in ("state_dict", "task"))
     if not (
@@ -192,9 +215,9 @@ def read_checkpoint(path: Path, *, task: str | None = None) -> dict[str, Any]:
         and isinstance(weights, dict)
         and all(isinstance(key, str) and isinstance(value, Tensor) for key, value in weights.items())
     ):
-        raise CheckpointError(f"ckpt_path must be a checkpoint of torchrefract, got {path}")
+        raise CheckpointError(f"{argument} must be a checkpoint of torchrefract, got {path}")
     if task not in (None, name):
-        raise CheckpointError(f"ckpt_path must be a checkpoint of the task {task}, got {path} of {name}")
+        raise CheckpointError(f"{argument} must be a checkpoint of the task {task}, got {path} of {name}")
     return checkpoint | {"state_dict": rename_weights(weights)}
 
 
@@ -212,11 +235,16 @@ def rename_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def check_fits(
-    checkpoint: Mapping[str, Any], model: nn.Module, path: Path, *, config: Mapping[str, Any] | None = None
+    checkpoint: Mapping[str, Any],
+    model: nn.Module,
+    path: Path,
+    *,
+    config: Mapping[str, Any] | None = None,
+    argument: str = "ckpt_path",
 ) -> None:
     """Raise CheckpointError unless the weights of a checkpoint have the names and shapes of a model's.
 
-    The message names the path and, if the model's configuration is given, both models.
+    The message names the option `argument`, the path and, if the configuration of the model is given, both models.
     """
     shapes, saved = (
         {name: value.shape for name, value in weights.items()}
@@ -230,7 +258,7 @@ def check_fits(
         name, other = model_name(config), model_name(checkpoint["config"]["model"])
         if name != other:
             expected, reason = f"{name}, which model= names", f" of {other}"
-    raise CheckpointError(f"ckpt_path must be a checkpoint of {expected}, got {path}{reason}")
+    raise CheckpointError(f"{argument} must be a checkpoint of {expected}, got {path}{reason}")
 
 
 def model_name(model: Mapping[str, Any]) -> str:

@@ -79,8 +79,7 @@ class FlowDiffusion(AveragedRestoration):
     ):
         if not isinstance(task, Undistort):
             raise TypeError(
-                "task must be Undistort for FlowDiffusion: add model=ddpm_image for the diffusion of an image, got "
-                f"{type(task).__name__}"
+                f"task must be Undistort for FlowDiffusion: add model=bridge for an image, got {type(task).__name__}"
             )
         num_coefficients = task.channels * NUM_TERMS
         if check_count("components", components) > num_coefficients:

@@ -1,7 +1,6 @@
 """The score of a model on degraded images, by scene and severity, and the physical value that it tolerates."""
 
 import itertools
-import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from torch.utils import _pytree as pytree
 
 from torchrefract import random
 from torchrefract._tensor import sharing_results
-from torchrefract._validation import check_count, check_number
+from torchrefract._validation import check_count, check_number, warn
 from torchrefract.effects.base import Effect
 from torchrefract.labels.targets import warp_moved_labels
 from torchrefract.robustness.set_scores import Summary, set_scores, summarize
@@ -281,7 +280,7 @@ def evaluate(
     if failures:
         name, reason = next(iter(failures.items()))
         count = f"{len(failures)} of {len(scored) + len(failures)}"
-        warnings.warn(f"predict failed for {count} images, which are left out: {name}: {reason}", stacklevel=2)
+        warn(f"predict failed for {count} images, which are left out: {name}: {reason}")
     return _collect(scored, quantities, failures)
 
 

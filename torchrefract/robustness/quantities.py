@@ -63,6 +63,7 @@ def _of_child(index: int, quantity: Quantity) -> Quantity:
 QUANTITIES = {
     "cheap_dashcam": _OF_EFFECTS[LensDistortion],
     "cape_town_fog": _VISIBILITY,
+    "night_fog": _of_child(0, _VISIBILITY),
     "limpopo_sun_glare": _OF_EFFECTS[SunGlare],
     "highveld_heat_haze": _of_child(0, _OF_EFFECTS[RoadMirage]),
     "highveld_telephoto": _OF_EFFECTS[PhysicalTurbulence],

@@ -1,7 +1,6 @@
 """Scores of all images together: COCO's mAP of detections, and the mean IoU over all pixels of masks."""
 
 import base64
-import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -9,6 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchrefract._validation import warn
 
 Summary = tuple[str, Any]
 
@@ -88,7 +89,7 @@ def _mean_average_precision(contents: Sequence[Any]) -> dict[str, float]:
 
         metric = MeanAveragePrecision(backend="pycocotools")
     except ImportError as error:
-        warnings.warn(f"mAP is left out: {error}; pip install 'torchrefract[train]'", stacklevel=2)
+        warn(f"mAP is left out: {error}; pip install 'torchrefract[train]'")
         return {}
     metric.warn_on_many_detections = False
     pairs = [(_decode(detections, 6), _decode(labels, 5)) for detections, labels in contents]

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -83,3 +84,25 @@ def test_ray_without_actors_raises(call, words):
     pytest.importorskip("ray")  # in its own extra
     message = call("generate", *words("out"), "engine=ray").message
     assert message == "workers must be at least 1 for engine=ray, which counts its actors, got 0"
+
+
+@pytest.mark.quick
+def test_a_cluster_that_does_not_answer_is_one_line_after_a_bounded_wait(call, words, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchrefract.data.pairs.ray_engine._CONNECT_SECONDS", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    start = time.monotonic()
+    outcome = call("generate", *words("out"), "workers=1", "engine=ray", f"engine.address={address}")
+    assert outcome.message == (
+        f"engine.address must be that of a running cluster of Ray, got {address} (Connection refused, tried for 1 s); "
+        "`ray start --head` starts one and prints its address"
+    )
+    assert outcome.out == f"connecting to Ray at {address}\n"
+    assert time.monotonic() - start < 5
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_that_ray_cannot_join_is_one_line(call, words):
+    pytest.importorskip("ray")  # in its own extra
+    message = call("generate", *words("out"), "workers=1", "engine=ray", "engine.address=auto").message
+    assert message.startswith("engine.address must be that of a running cluster of Ray, got auto (Could not find any ")

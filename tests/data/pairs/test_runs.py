@@ -62,8 +62,8 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def without_manifests(files: dict[str, str]) -> dict[str, str]:
-    """The checksums of a set without its manifests, of which each shard has one."""
-    return {name: value for name, value in files.items() if not name.startswith("manifest")}
+    """The checksums of a set without its manifests, of which each shard has one, with a copy of config.json."""
+    return {name: value for name, value in files.items() if not name.startswith(("manifest", "config-"))}
 
 
 def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, sums, complete):
@@ -166,5 +166,9 @@ def test_a_larger_count_adds_pairs_and_keeps_the_others(call, tmp_path, words, s
     assert ": 3 pairs made, 15 in total" in outcome.out
     after = sums(tmp_path / "out")
     assert before.items() <= after.items()
-    assert len(set(after) - set(before)) == 3 * 6 + 5
+    added = set(after) - set(before)
+    assert len({name for name in added if name.startswith("pairs/")}) == 3 * 6
+    assert {name for name in added if not name.startswith("pairs/")} == {
+        *("README.md", "config.json", "manifest.jsonl", "pairs.parquet", "parameters.png", "sources.parquet")
+    }
     assert "count must be at least" in call("generate", *words("out", "count=12")).message

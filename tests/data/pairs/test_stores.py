@@ -6,11 +6,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
@@ -23,13 +22,10 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
-def memory(frames, monkeypatch) -> Iterator[MemoryFileSystem]:
-    """Return the store memory:// with the frames in memory://frames, without pauses before further tries."""
-    monkeypatch.setattr("torchrefract._io._PAUSES", (0.0, 0.0, 0.0))
-    store = fsspec.filesystem("memory")
-    store.put(str(frames), "/frames", recursive=True)
-    yield store
-    store.rm("/", recursive=True)
+def memory(memory, frames) -> MemoryFileSystem:
+    """Return the store memory:// with the frames in memory://frames."""
+    memory.put(str(frames), "/frames", recursive=True)
+    return memory
 
 
 def sums_in(store: Any, root: str) -> dict[str, str]:
@@ -163,6 +159,27 @@ def test_the_name_of_a_folder_in_a_store_is_no_pattern(call, words, memory, name
     assert ": 4 of 4 pairs" in call("merge", f"out=memory://sets/{name}").out
     assert len(PairedFolder(f"memory://sets/{name}")) == 4
     assert {path: value for path, value in sums_in(memory, "/sets").items() if f"/{name}/" not in path} == before
+
+
+@pytest.mark.parametrize("times", [2, 100])
+def test_a_listing_that_is_throttled_is_tried_again_and_loses_no_folder(call, words, memory, monkeypatch, times):
+    ls, failures = MemoryFileSystem.ls, list[str]()
+
+    def throttle(self: Any, path: str, *more: Any, **others: Any) -> Any:
+        if path.strip("/") == "frames/drive1" and len(failures) < times:
+            failures.append(path)
+            raise OSError(16, "Please reduce your request rate")
+        return ls(self, path, *more, **others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryFileSystem, "ls", throttle)
+        outcome = call("generate", *words("memory://out", source="memory://frames"))
+    if times == 2:
+        assert outcome.code == 0
+        assert ": 12 pairs made, 12 in total" in outcome.out
+    else:
+        assert outcome.err.splitlines()[-1].startswith("error: ")
+        assert "Please reduce your request rate, after 4 tries" in outcome.err.splitlines()[-1]
 
 
 def test_videos_are_read_from_a_store(call, words, memory, tmp_path):

@@ -124,7 +124,8 @@ def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: 
         "",
         "`manifest.jsonl` has a line of JSON for each pair: source, drive, split, all parameters, and files with "
         "checksums. Several files `manifest-*.jsonl` can be concatenated. `degrade(clean, seed=seed, keys=[key])` "
-        "makes a pair again. `config.json` holds the configuration.",
+        "makes a pair again. `pairs.parquet` is a table of the pairs with a column for each parameter. `config.json` "
+        "holds the configuration.",
     ]
     return "\n".join(lines) + "\n"
 

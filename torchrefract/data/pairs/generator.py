@@ -21,11 +21,13 @@ from torch import Tensor
 
 from torchrefract._io import make_folder, replace_file
 from torchrefract._validation import UsageError
+from torchrefract.cameras.camera import Camera
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source
 from torchrefract.data.images import (
     ChangedImageError,
     UnreadableImageError,
+    check_frame_of_camera,
     decode_image,
     fit,
     is_lost,
@@ -53,10 +55,17 @@ class SourceReader:
         root: folder of the sources.
         size: (height, width), px, to crop and reduce frames to; None keeps their size.
         depth: folder of their depth maps.
+        camera: of the frames in the files; all must have its shape.
     """
 
-    def __init__(self, root: Path, size: tuple[int, int] | None, depth: DepthFolder | None = None):
-        self.root, self.size, self.depth = root, size, depth
+    def __init__(
+        self,
+        root: Path,
+        size: tuple[int, int] | None,
+        depth: DepthFolder | None = None,
+        camera: Camera | None = None,
+    ):
+        self.root, self.size, self.depth, self.camera = root, size, depth, camera
         self._video, self._index = "", -1  # path and frame that were read last
         self._frames: Iterator[tuple[int, Tensor]] = iter(())
 
@@ -72,9 +81,10 @@ class SourceReader:
         """Read a frame as `read` does, and its depth (1, H, W), m, if there is a folder of depth maps.
 
         Raises:
-            UsageError: there is no depth map of the frame.
+            UsageError: there is no depth map of the frame, or it has not the shape of the camera's.
         """
         image = self._read_image(source) if source.frame is None else self._read_video(source.path, source.frame)
+        check_frame_of_camera(self.camera, source.path, height=image.shape[1], width=image.shape[2])
         depth = None
         if self.depth is not None:
             depth = self.depth.read(

@@ -1,4 +1,4 @@
-"""The state of a pair set: config.json, and one line of JSON for each pair in one or several files manifest*.jsonl."""
+"""The manifest of a pair set: one line of JSON for each pair, in one or several files manifest*.jsonl."""
 
 import hashlib
 import json
@@ -7,7 +7,7 @@ import re
 import sys
 import tarfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
@@ -15,17 +15,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
-from torchrefract._io import is_remote, make_folder, matching_files, read_bytes, remove_file, replace_file
+from torchrefract._io import is_remote, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError, opened
+from torchrefract.data.pairs.configuration import remove_shard_config, shard_suffix
 from torchrefract.data.pairs.files import DamagedPairError
 
 if sys.platform != "win32":
     import fcntl
 
 _MANIFESTS = "manifest*.jsonl"
-_SHOWN = 6  # differences in a message
-_CONFIG = "config.json"
 # A manifest may come from an untrusted source, so only these paths are opened.
 _PATH = re.compile(r"pairs/[0-9]+/[0-9]+\.[a-z_]+\.[a-z]+|tars/[0-9]+\.tar")
 _SUFFIX = re.compile(r"[a-z_]+\.[a-z]+")
@@ -192,7 +191,7 @@ class Manifest:
 
     def __init__(self, out: Path, shard: int, shards: int):
         self.out = out
-        self.path = out / ("manifest.jsonl" if shards == 1 else f"manifest-{shard:05d}-of-{shards:05d}.jsonl")
+        self.path = out / f"manifest{shard_suffix(shard, shards)}.jsonl"
         self._rows, self._parts, self._last = list[PairRow](), 0, time.monotonic()
 
     def open(
@@ -235,6 +234,7 @@ class Manifest:
                     self._write(kept, path)
                 else:
                     remove_file(path)
+                    remove_shard_config(path)
 
     def add(self, rows: Iterable[PairRow]) -> None:
         """Append the rows of pairs whose files are written."""
@@ -306,57 +306,6 @@ class Manifest:
         return (info.name, info.size) == (f"{name}.{suffix}", file.bytes)
 
 
-def claim(
-    out: Path,
-    settings: Mapping[str, Any],
-    *,
-    count: int,
-    about: Mapping[str, Any],
-    earlier: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Create an output folder, or check that it has the same settings, and write its config.json.
-
-    Args:
-        settings: everything that determines the content, of types that JSON has.
-        count: number of results; a later run may raise it.
-        about: further entries of config.json that do not change the content.
-        earlier: values of settings that folders of earlier versions do not state.
-
-    Returns:
-        the previous content of config.json; empty for a new folder.
-
-    Raises:
-        UsageError: the folder has other settings or other content, or `count` is lower than before.
-        OSError: the folder cannot be written.
-    """
-    make_folder(out)
-    new = json.loads(json.dumps(settings))
-    path, previous = out / _CONFIG, {}
-    # List the folder before testing for config.json, because another shard may be writing to it.
-    others = sorted(file.name for file in (out.iterdir() if out.is_dir() else ()) if not file.name.startswith("."))
-    if path.is_file():
-        try:
-            previous = json.loads(read_bytes(path))
-        except ValueError:
-            previous = None
-        if not isinstance(previous, dict) or not _has_valid_values(previous):
-            raise UsageError(f"out must be a folder with a valid {_CONFIG}, got {path}, which is damaged")
-        _check_same({**(earlier or {}), **previous.get("settings", {})}, new, out)
-        if count < previous.get("count", 0):
-            raise UsageError(f"count must be at least that of the pairs in {out}, {previous['count']}, got {count}")
-    elif others:
-        raise UsageError(f"out must be a new folder or one of this command, got {out}, which holds {others[0]}")
-    document = {"settings": new, "count": count, **about}
-    if document != previous:
-        with replace_file(path) as temporary:
-            temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-    return previous
-
-
-def _has_valid_values(config: Mapping[str, Any]) -> bool:
-    return isinstance(config.get("settings", {}), dict) and isinstance(config.get("count", 0), int)
-
-
 @contextmanager
 def locked(argument: str, folder: Path, name: str = "run", *, wait: bool = False) -> Iterator[None]:
     """Hold a lock on an existing folder until the block or the process ends; on Windows and in a store, do nothing.
@@ -402,23 +351,3 @@ def locked_shard(out: Path, shard: int, shards: int) -> Iterator[None]:
                 with locked("out", out, path.stem.removeprefix(".")):
                     pass
         yield
-
-
-def _check_same(previous: Any, new: Any, out: Path) -> None:
-    before, after = dict(_flatten(previous)), dict(_flatten(new))
-    different = [name for name in before | after if before.get(name) != after.get(name)]
-    if different:
-        shown = [f"{name} is {before.get(name)} there and {after.get(name)} here" for name in different[:_SHOWN]]
-        more = f", and {len(different) - _SHOWN} more" if len(different) > _SHOWN else ""
-        raise UsageError(
-            f"out must be a folder of the same configuration, got {out}, where {', '.join(shown)}{more}; choose "
-            "another folder"
-        )
-
-
-def _flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        for name, part in value.items():
-            yield from _flatten(part, f"{prefix}.{name}" if prefix else str(name))
-    else:
-        yield prefix, value

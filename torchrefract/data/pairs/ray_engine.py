@@ -3,6 +3,8 @@
 import logging
 import os
 import pickle
+import socket
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -14,6 +16,7 @@ from torchrefract.data.workers import use_one_thread
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
+_CONNECT_SECONDS = 15.0  # a cluster that is being started has this long to answer
 _SILENT: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
 
 
@@ -40,7 +43,7 @@ def map_in_actors(
         the results, in any order.
 
     Raises:
-        UsageError: this machine has fewer GPUs.
+        UsageError: this machine has fewer GPUs, or Ray cannot join the cluster.
         Exception: any error of `work`.
     """
     import ray  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
@@ -49,8 +52,10 @@ def map_in_actors(
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # it prints an error when an actor could restart
     started = not ray.is_initialized()
-    if started:
-        ray.init(address=address, **_SILENT, **({} if address else {"num_cpus": workers + 1}))
+    if started and address:
+        _join_cluster(address)
+    elif started:
+        ray.init(address="local", num_cpus=workers + 1, **_SILENT)
     try:
         if num_gpus:
             _check_gpus(ray.cluster_resources().get("GPU", 0), workers, num_gpus, can_wait=address is not None)
@@ -76,6 +81,48 @@ def map_in_actors(
     finally:
         if started:
             ray.shutdown()
+
+
+def check_cluster(address: str) -> None:
+    """Say that a cluster is being reached, and wait until something answers at its address HOST:PORT.
+
+    Ray would try for minutes without a word. An address without a port, such as auto, is left to Ray.
+
+    Raises:
+        UsageError: nothing answers within 15 s.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdecimal():
+        return
+    print(f"connecting to Ray at {address}", flush=True)
+    end = time.monotonic() + _CONNECT_SECONDS
+    while True:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), max(1.0, end - time.monotonic())).close()
+            return
+        except (OSError, OverflowError) as error:  # the latter for a port above 65535
+            if time.monotonic() > end - 1:
+                raise _cluster_error(
+                    address, f"{getattr(error, 'strerror', None) or error}, tried for {_CONNECT_SECONDS:.0f} s"
+                ) from error
+        time.sleep(1)
+
+
+def _join_cluster(address: str) -> None:
+    import ray  # noqa: PLC0415  # pyright: ignore[reportMissingImports]  # in its own extra
+
+    try:
+        ray.init(address=address, **_SILENT)
+    # Ray ends the process if something else than Ray answers.
+    except (ConnectionError, RuntimeError, ValueError, SystemExit) as error:
+        raise _cluster_error(address, "no Ray" if isinstance(error, SystemExit) else f"{error}".rstrip(".")) from error
+
+
+def _cluster_error(address: str, reason: str) -> UsageError:
+    return UsageError(
+        f"engine.address must be that of a running cluster of Ray, got {address} ({reason}); `ray start --head` starts "
+        "one and prints its address"
+    )
 
 
 def _check_gpus(available: float, workers: int, num_gpus: float, *, can_wait: bool) -> None:

@@ -5,12 +5,12 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from torchrefract._io import is_remote, read_bytes, replace_file, retried
+from torchrefract._io import is_remote, read_bytes, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, list_names, select_val_drives, split_frames
@@ -73,7 +73,7 @@ class Sources(NamedTuple):
         digest = hashlib.sha256()
         for frame in self.frames():
             path = depth.find(frame.path, frame.frame)
-            digest.update(ascii([path.name, path.stat().st_size]).encode())
+            digest.update(ascii([path.name, depth.size_bytes(path)]).encode())
         return digest.hexdigest()
 
     def write(self, path: Path, options: dict[str, Any]) -> None:
@@ -127,7 +127,7 @@ def find_sources(
         if source.suffix.lower() not in VIDEOS:
             raise UsageError(f"source must be a folder, or a video ({', '.join(VIDEOS)}), got the file {source}")
         return _find_video_frames(source.parent, {source.name: source.stat().st_size}, every, val_share, seed)
-    sizes = _sizes_in_store(source) if is_remote(source) else None
+    sizes = sizes_in_store(source) if is_remote(source) else None
     files = sorted(list_names(source) if sizes is None else sizes)
 
     def size_of(name: str) -> int | None:
@@ -198,21 +198,6 @@ def table_of(frames: Sequence[Source], size_of: Callable[[str], int | None]) -> 
         "key": pa.array([key_of(frame.name) for frame in frames], pa.int64()),
     }
     return pa.table(columns)
-
-
-def _sizes_in_store(root: Path) -> dict[str, int]:
-    """Return the size of each file of a folder in a store by its name, without hidden ones."""
-    store, sizes = cast(Any, root), dict[str, int]()
-
-    def scan() -> None:
-        start = store.path.strip("/")
-        for folder, _, files in store.fs.walk(store.path, detail=True):
-            inner = folder.strip("/")[len(start) :].strip("/")
-            names = {f"{inner}/{name}".lstrip("/"): info["size"] for name, info in files.items()}
-            sizes.update({name: size for name, size in names.items() if "/." not in f"/{name}"})
-
-    retried(scan, root)
-    return sizes
 
 
 def _size(path: str) -> int | None:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -20,6 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from torchrefract._validation import warn
 from torchrefract.warping.grid import pixel_axes
 
 _STRIDE = 32
@@ -260,7 +260,7 @@ def _find_weights(encoder: str, pretrained: str) -> tuple[Path, list[float], lis
     if encoder.startswith(_TIMM) and config.get("architecture") != encoder.removeprefix(_TIMM).partition(".")[0]:
         raise ValueError(f"pretrained must be weights of {encoder}, got {folder} of {config.get('architecture')}")
     if (name := weights_license(encoder)) and ("non-commercial" in name or "-nc" in name):
-        warnings.warn(f"the pretrained weights of {encoder} come under this license: {name}", stacklevel=2)
+        warn(f"the pretrained weights of {encoder} come under this license: {name}")
     return folder / _TENSORS, mean, std
 
 

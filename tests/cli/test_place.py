@@ -1,0 +1,131 @@
+"""`camera=` and `horizon=` of commands."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from torchrefract import presets
+from torchrefract.cameras.camera import Camera
+from torchrefract.cameras.io import read_camera, write_opencv
+from torchrefract.data.images import fit, read_image
+from torchrefract.data.pairs.manifest import find_manifests, scan_rows
+from torchrefract.random import key_of
+
+COMMANDS = {
+    "degrade": ("source=frames", "workers=0"),
+    "generate": ("source=frames", "workers=0", "license=CC0"),
+    "preview": ("frames/a.png",),
+}
+PLACE = ("camera=camera.yaml", "horizon=0.4")
+FOG = "scene=cape_town_fog"
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Write the frames a.png and b.png, 48 x 64, and camera.yaml of them."""
+    (tmp_path / "frames").mkdir()
+    for i, name in enumerate("ab"):
+        pixels = np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "frames" / f"{name}.png"), pixels)
+    write_camera(tmp_path / "camera.yaml", 48, 64)
+    return tmp_path
+
+
+def write_camera(path: Path, height: int, width: int) -> None:
+    pinhole: dict[str, Any] = {"fx": 40.0, "fy": 42.0, "cx": width / 2 + 3, "cy": height / 2 - 2}
+    write_opencv(path, Camera(width=width, height=height, **pinhole, coefficients=(0.0,) * 4))
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """Return the pictures of a command by their names."""
+    if folder.is_file():
+        return {"": folder.read_bytes()}
+    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*.png"))}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_camera_and_horizon_reach_the_scene_of_each_command(call, folder, command):
+    out = ".png" if command == "preview" else ""
+    given = {
+        "both": PLACE,
+        "scene": [f"scene.{option}" for option in PLACE],
+        "camera": PLACE[:1],
+        "horizon": PLACE[1:],
+        "none": (),
+    }
+    for name, words in given.items():
+        outcome = call(command, *COMMANDS[command], FOG, *words, f"out={name}{out}")
+        assert outcome.code == 0, outcome.err
+    made = {name: results(folder / f"{name}{out}") for name in given}
+    assert made["both"] == made["scene"]
+    names = ("both", "camera", "horizon", "none")
+    assert all(made[a] != made[b] for i, a in enumerate(names) for b in names[:i])
+    for words, message in {
+        ("camera=none.yaml",): "No such file or directory: 'none.yaml'",
+        ("horizon=20",): "horizon must be a number in [-10, 10], got 20",
+        (
+            "camera=camera.yaml",
+            "scene=cheap_dashcam",
+        ): "camera must be given with a scene that takes it, got scene=chea",
+    }.items():
+        assert message in call(command, *COMMANDS[command], FOG, *words, f"out=bad{out}").message
+        assert not (folder / f"bad{out}").exists()
+
+
+def test_a_picture_is_degraded_with_the_numbers_of_the_camera_file(call, folder):
+    assert call("degrade", *COMMANDS["degrade"], FOG, *PLACE, "out=out").code == 0
+    image = read_image(folder / "frames" / "a.png")[None]
+    fog = presets.cape_town_fog(camera=read_camera(folder / "camera.yaml"), horizon=0.4)
+    expected = fog.degrade(image, seed=0, keys=[key_of("a.png")]).image
+    written = read_image(folder / "out" / "a.png")
+    assert (written - expected[0]).abs().max() < 0.51 / 255 + 1e-5
+
+
+def test_cropped_frames_have_a_cropped_camera(call, folder):
+    options = (*COMMANDS["generate"], FOG, *PLACE, "size=[20,40]", "out=out")
+    assert call("generate", *options).code == 0
+    cropped = read_camera(folder / "camera.yaml").cropped(left=0, top=8, width=64, height=32)
+    row = next(scan_rows(find_manifests(folder / "out"), lambda row: row.source == "a.png"))[0]
+    clean = fit(read_image(folder / "frames" / "a.png"), (20, 40))[None]
+    fog = presets.cape_town_fog(camera=cropped, horizon=0.4)
+    expected = fog.degrade(clean, seed=row.seed, keys=[row.key]).image[0]
+    written = read_image(folder / "out" / row.files["corrupted.png"].path)
+    assert (written - expected).abs().max() < 0.51 / 255 + 1e-5
+    write_camera(folder / "camera.yaml", 32, 64)  # of frames with the shape of the crop, not of the files
+    outcome = call("generate", *options, "out=other")
+    assert outcome.code == 1
+    assert "error: camera must be that of all frames, got a.png: image must have the shape" in outcome.err
+
+
+def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(call, folder):
+    for drive in ("u", "v"):
+        (folder / "drives" / drive).mkdir(parents=True)
+        for name in "ab":
+            shutil.copy(folder / "frames" / f"{name}.png", folder / "drives" / drive)
+    data = ("data=frames", "data.root=drives", "data.size=[32,64]", "data.batch_size=1", "data.workers=0")
+    options = ("+task=deweather", *data, "trainer.max_epochs=1", "model.network.width=4")
+    outcome = call("train", *options, *PLACE, "hydra.run.dir=run")
+    assert outcome.code == 0, outcome.err
+    config = OmegaConf.load(folder / "run" / "config.yaml")
+    expected = presets.cape_town_fog(
+        camera=read_camera(folder / "camera.yaml").cropped(left=0, top=8, width=64, height=32), horizon=0.4
+    )
+    for scene in (config.scene, config.data.effect):
+        assert repr(instantiate(scene)) == repr(expected)
+    (folder / "camera.yaml").unlink()
+    scored = call("eval", "ckpt_path=run/best.ckpt", "hydra.run.dir=again")
+    assert scored.code == 0, scored.err
+    assert "as in its own validation" in scored.out
+    write_camera(folder / "camera.yaml", 48, 64)
+    wider = ("trainer.max_epochs=2", "model.network.width=8", "ckpt_path=run/last.ckpt")
+    assert "got run/last.ckpt, where " in call("train", *options, *PLACE, *wider).message
+    write_camera(folder / "camera.yaml", 32, 64)
+    assert "camera must be that of all frames, got drives/v/a.png" in call("train", *options, *PLACE).message
+    message = call("train", "+task=deweather", *PLACE).message
+    assert "camera and horizon must be those of frames in a folder, data=frames" in message

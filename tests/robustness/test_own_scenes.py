@@ -115,8 +115,8 @@ def test_a_run_is_not_continued_with_other_parameters_of_a_scene(call, tmp_path,
 @pytest.mark.parametrize(
     ("scene", "message"),
     [
-        ("scene=cape_town_frog", "scene must be some of cheap_dashcam, cape_town_fog, limpopo_sun_glare, "),
-        ("scene=lost.yaml", "scene must be some of cheap_dashcam, cape_town_fog, limpopo_sun_glare, "),
+        ("scene=cape_town_frog", "scene must be some of cheap_dashcam, cape_town_fog, night_fog, limpopo_sun_glare, "),
+        ("scene=lost.yaml", "scene must be some of cheap_dashcam, cape_town_fog, night_fog, limpopo_sun_glare, "),
         ("scene=mine:nothing", "scene: a function must be package.module:name that can be imported, got mine:nothing"),
         ("scene=mine:text", "scene must be an effect of torchrefract, got str of mine:text"),
         ("scene=few.yaml", "scene: few.yaml must hold the _target_ of an effect, or one for severity 1, got neither"),

@@ -248,8 +248,6 @@ def _metric(cfg: DictConfig, path: Path) -> str:
     return f"agreement ({name})" if cfg.labels is None else name
 
 
-
-
 def _folder(cfg: DictConfig) -> _Folder:
     """Find the pictures and their labels."""
     path = Path(str(cfg.data)).expanduser()

@@ -10,7 +10,6 @@ Options:
     scene=NAME              degradation, required: cheap_dashcam, cape_town_fog, unpaved_road, paper_weather, ...
     severity=3              1 (barely visible) to 5
     labels=PATH             of the pictures: COCO JSON, folder of YOLO txt files, or folder of masks of the same names
-    mask_fill=0             id of the pixels of a mask that show nothing of the clean picture
     maps=false              true writes flow, transmission and masks as PNG, as generate does; or npz, safetensors
     drive_by=folder         draw the pictures of each drive once, as the frames of a video: auto, folder or prefix
     depth=DIR               folder of depth maps, as estimate_depth writes

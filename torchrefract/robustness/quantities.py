@@ -51,11 +51,11 @@ def _quantity(effect: Effect) -> Quantity | None:
 class _GetOfChild(NamedTuple):
     """Return the value of a child from the parameters of its composition."""
 
-    index: int
+    child: int
     get: Callable[[Any], Tensor]
 
     def __call__(self, params: Any) -> Tensor:
-        return self.get(params.children[self.index])
+        return self.get(params.children[self.child])
 
 
 def _of_child(index: int, quantity: Quantity) -> Quantity:

@@ -223,6 +223,25 @@ def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(s
     assert read_checkpoint(path, task="undistort")["global_step"] >= 2
 
 
+def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):
+    words = ("+task=undistort", *small, "run_dir=run", "trainer.max_epochs=1000", "data.workers=1")
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    options = {"cwd": tmp_path, "env": environment, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-m", "torchrefract.train", *words]
+    with subprocess.Popen(command, start_new_session=True, **options) as process:
+        try:
+            path, end = tmp_path / "run" / "last.ckpt", time.monotonic() + 200
+            while not path.exists() and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.05)
+            os.killpg(process.pid, signal.SIGTERM)  # as SLURM and systemd send it
+            _, message = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 143, message
+    (line,) = (line for line in message.splitlines() if "stopped" in line or "Error" in line)
+    assert re.fullmatch(r"stopped by SIGTERM in step \d+; ckpt_path=run/last.ckpt continues", line)
+
+
 def test_a_finished_run_cannot_be_resumed(call, trained):
     message = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run").message
     assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"

@@ -19,6 +19,7 @@ from torchrefract.data.frames import FrameFolder
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.stream import PairBatches, check_streamed
 from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.data.workers import ignore_sigterm
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.types import Degraded, Frame, Pair
@@ -219,6 +220,7 @@ class PairData(LightningDataModule):
             sampler=sampler,
             drop_last=training and batch_size is not None,
             num_workers=workers,
+            worker_init_fn=ignore_sigterm,
             multiprocessing_context=start_method() if workers else None,
             persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),

@@ -69,6 +69,15 @@ def use_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
+def ignore_sigterm(worker: int) -> None:
+    """Leave SIGTERM to the training process, as `worker_init_fn` of a DataLoader, whose workers end with that process.
+
+    SLURM and systemd send the signal to all processes of a job; a worker that ended first would stop the training
+    before it has saved its checkpoint.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
 def num_cores() -> int:
     """Return the number of cores for this process; processes that torchrun started on one machine share them."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

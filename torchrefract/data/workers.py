@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 from typing import Any, TypeVar
 
@@ -47,7 +49,8 @@ def map_in_processes(
     pending = set[Future[_Result]]()
     try:
         for item in items:
-            pending.add(pool.submit(_work, item))
+            with _held_interrupts():
+                pending.add(pool.submit(_work, item))
             if len(pending) >= _QUEUED_ITEMS * workers:
                 done, pending = wait(pending, return_when=FIRST_COMPLETED)
                 yield from (future.result() for future in done)
@@ -89,7 +92,32 @@ def _context(preload: str) -> BaseContext:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     multiprocessing.set_forkserver_preload([preload])
+    with _interrupts(signal.SIG_IGN):  # its server would print a traceback for Ctrl-C while it imports
+        forkserver.ensure_running()
     return multiprocessing.get_context("forkserver")
+
+
+@contextmanager
+def _held_interrupts() -> Iterator[None]:
+    """Hold back Ctrl-C until the end of the block, since a process that is interrupted while it starts would go on."""
+    received: list[int] = []
+    with _interrupts(lambda number, _: received.append(number)):
+        yield
+    if received:
+        signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def _interrupts(handler: Any) -> Iterator[None]:
+    """Handle SIGINT in another way; processes that are started ignore it too if the handler is SIG_IGN."""
+    if threading.current_thread() is not threading.main_thread():  # only there a handler can be set
+        yield
+        return
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Worker:

@@ -212,7 +212,7 @@ def highveld_telephoto(
 
     Args:
         severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day. The
-            aperture over Fried's parameter, D / r0 at 1 km, is up to 0.25, 0.47, 0.98, 1.9, 3.9: below 1 the air blurs
+            aperture over Fried's parameter, D / r0 at 1 km, is up to 0.25, 0.48, 0.99, 1.9, 3.9: below 1 the air blurs
             nothing that the aperture of 2 mm shows, so severities 1 to 3 are not blurred.
         camera, horizon, depth: as for all scenes; without a camera, frames have a focal length of 4 widths.
         blur: `wavelength` and `tolerance` of `BlurredTurbulence`.

@@ -75,7 +75,7 @@ def test_each_pixel_is_blurred_by_the_air_in_front_of_it(with_height):
     generator = torch.Generator().manual_seed(0)
     light = torch.rand(1, 2, 14, 18, generator=generator, dtype=torch.float64)
     depth = 1200 * torch.rand(1, 1, 14, 18, generator=generator, dtype=torch.float64)
-    options = {"height": 2.0, "horizon": 0.4} if with_height else {"height": None}
+    options: dict[str, Any] = {"height": 2.0, "horizon": 0.4} if with_height else {"height": None}
     actual = blur_of(linear_to_srgb(light), depth, **options)
     strength = (APERTURE / fried_parameter(CN2, REACH, wavelength=WAVELENGTH)) ** (5 / 3)
     thickness = strength * depth[0, 0].clamp(max=REACH) / REACH
@@ -178,12 +178,13 @@ def test_the_plan_leaves_out_a_blur_that_cannot_be_seen():
     assert "D / r0 is up to 0.78 at the reach: below 1 the diffraction of the aperture hides the blur" in str(plan)
     image = torch.rand(1, 3, 36, 64, generator=torch.Generator().manual_seed(0))
     assert torch.equal(hidden.degrade(image, seed=1).image, image)
-    for options in ({"cn2_range": (1e-12, 2e-12)}, {"aperture": 0.003}, {"wavelength": 400e-9}, {"reach": 2000.0}):
-        seen = TurbulenceBlur(**{"cn2_range": (1e-13, 1e-12)} | options)
+    stronger: dict[str, Any] = {"cn2_range": (1e-12, 2e-12), "aperture": 0.003, "wavelength": 400e-9, "reach": 2000.0}
+    for name, value in stronger.items():
+        seen = TurbulenceBlur(**{"cn2_range": (1e-13, 1e-12), name: value})
         assert not seen.plan(1080, 1920).is_identity
         assert f"D / r0 is up to {seen.blur_ratio:.2g} at the reach" in str(seen.plan(1080, 1920))
     # No level moves where pixels are far coarser than the blur, whatever D / r0 is.
-    coarse = {"cn2_range": (1e-12, 1e-12), "aperture": 0.01, "focal": 0.002}
+    coarse: dict[str, Any] = {"cn2_range": (1e-12, 1e-12), "aperture": 0.01, "focal": 0.002}
     assert TurbulenceBlur(**coarse).blur_ratio > 1
     plan = TurbulenceBlur(**coarse).plan(108, 192)
     assert plan.is_identity
@@ -218,12 +219,19 @@ def test_an_invalid_pixel_counts_as_black(value):
 
 @pytest.mark.quick
 def test_one_air_moves_and_blurs():
-    place = {"aperture": 0.01, "focal": 6.0, "reach": 600.0, "height": None, "depth": GroundPlaneDepth()}
+    place: dict[str, Any] = {
+        "aperture": 0.01,
+        "focal": 6.0,
+        "reach": 600.0,
+        "height": None,
+        "depth": GroundPlaneDepth(),
+    }
     turbulence = PhysicalTurbulence(cn2_range=(1e-12, 1e-11), p=0.7, **place)
     both = BlurredTurbulence(turbulence, wavelength=WAVELENGTH)
     image = torch.rand(8, 3, 48, 64, generator=torch.Generator().manual_seed(0))
     degraded = both.degrade(image, seed=2)
     tilt, blur = degraded.params.children
+    assert torch.equal(tilt.tilt, turbulence.sample(image, seed=2).tilt)  # as if it were alone
     assert 0 < blur.applied.sum() < 8
     assert torch.equal(blur.applied, tilt.applied)
     amplitude = turbulence.equivalent_amplitude(64)[1] / (6 * 64)  # of Cn2 = 1e-11

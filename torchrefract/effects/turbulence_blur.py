@@ -21,7 +21,6 @@ from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.fields.turbulence_blur import View, blur_by_distance, halo_px, largest_change, num_distances
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_turbulence_blur
 from torchrefract.types import Range
-from torchrefract.warping.grid import field_dtype
 
 TOLERANCE = 0.5  # levels
 _STRONGEST = 1e-4  # Cn2
@@ -188,7 +187,7 @@ class TurbulenceBlur(PhotometricEffect):
 
     def _share_of_reach(self, image: Tensor, depth: Tensor | None, focal: float) -> Tensor:
         """Return the turbulence in front of each pixel, that of a level path as long as the reach being 1."""
-        depth = frame_depth(self.depth, image, depth).clamp(max=self.reach)
+        depth = frame_depth(cast(DepthSource, self.depth), image, depth).clamp(max=self.reach)
         share = depth / self.reach
         if self.height is None:
             return share
@@ -224,7 +223,7 @@ class BlurredTurbulence(Compose):
     ):
         if not isinstance(turbulence, PhysicalTurbulence):
             raise TypeError(f"turbulence must be a PhysicalTurbulence, got {type(turbulence).__name__}")
-        names = ("cn2_range", "camera", "focal", "aperture", "height", "horizon", "reach", "depth")
+        names = ("cn2_range", "camera", "focal", "aperture", "height", "horizon", "reach", "depth", "p")
         options = {name: getattr(turbulence, name) for name in names}
         blur = TurbulenceBlur(**options, wavelength=wavelength, tolerance=tolerance)
         super().__init__([turbulence, blur], tolerance_px=turbulence.tolerance_px, p=p)
@@ -250,8 +249,9 @@ class BlurredTurbulence(Compose):
         return self.blur.tolerance
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> ComposeParams:
-        """Draw the turbulence; the blur is that of its Cn2."""
-        params = super().sample_params(stream, image)
-        turbulence, blur = params.children
-        ratio = self.blur.ratio_of(self.turbulence.root_cn2(turbulence))
-        return params._replace(children=(turbulence, blur._replace(applied=turbulence.applied, ratio=ratio)))
+        """Draw the turbulence as it is drawn alone; the blur is that of its Cn2."""
+        applied, _ = self.sample_applied(random.fold(stream))
+        turbulence = self.turbulence.sample_params(stream, image)
+        turbulence = turbulence._replace(applied=turbulence.applied & applied)
+        blur = TurbulenceBlurParams(turbulence.applied, self.blur.ratio_of(self.turbulence.root_cn2(turbulence)))
+        return ComposeParams(applied, (turbulence, blur))

@@ -22,7 +22,7 @@ _TINY = 1e-30
 
 
 class View(NamedTuple):
-    """What decides how air blurs a frame.
+    """The camera behind the air.
 
     focal: px, fx and fy.
     aperture, wavelength: m.
@@ -144,7 +144,10 @@ def _steps(low: Tensor, high: Tensor, count: int, largest: float) -> list[Tensor
 
 
 def _spacing(x: Tensor) -> Tensor:
-    """Return int_0^x max over g in [0, 1] of g exp(-g y / 2) dy: 2 (1 - exp(-x / 2)), from 2 on 2 ln(x / 2) / e more."""
+    """Return int_0^x max over g in [0, 1] of g exp(-g y / 2) dy.
+
+    2 (1 - exp(-x / 2)) up to x = 2, then 2 (1 - 1/e) + 2 ln(x / 2) / e
+    """
     return -2 * torch.expm1(-x.clamp(max=2.0) / 2) + (x.clamp(min=2.0) / 2).log() * (2 / math.e)
 
 

@@ -233,8 +233,8 @@ def test_pictures_of_many_sizes_are_rejected(call, pictures):
     [
         (("images=none",), "images must be an existing folder of pictures, got none"),
         (("images=.",), "images must be a folder that holds .jpg, .jpeg, .png, .webp, .bmp, got ."),
-        (("lens_model=opencv7",), "lens_model: lens_model must be one of auto, opencv0, .*, division, got 'opencv7'"),
-        (("drop_share=2",), "drop_share: drop_share must be a number in .*, got 2"),
+        (("lens_model=opencv7",), "lens_model must be one of auto, opencv0, .*, division, got 'opencv7'"),
+        (("drop_share=2",), "drop_share must be a number in .*, got 2"),
         (("dictionary=DICT",), "board: dictionary must be one of DICT_.*, got 'DICT'"),
         (
             ("board=chessboard", "marker_mm=3"),

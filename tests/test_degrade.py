@@ -223,7 +223,7 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_degraded_by_the_next(cal
         (("out=raw",), "out must be another folder than that of source, got raw"),
         (("out=other",), "out must be a new folder or one of this command, got other, which holds a.png"),
         (("severity=6",), "scene: severity must be one of 1, 2, 3, 4, 5, got 6"),
-        (("maps=jpg",), "maps: maps must be one of png, npz, safetensors, got 'jpg'"),
+        (("maps=jpg",), "maps must be one of png, npz, safetensors, got 'jpg'"),
         (("labels=empty",), "labels must be a COCO JSON, or a folder of YOLO files (.txt) or masks (.png), got empty"),
         (("severities=3",), "an option must be one of source, out, severity, labels,"),
     ],
@@ -449,4 +449,4 @@ def test_pictures_of_a_drive_are_one_clip_like_a_video(call, tmp_path):
     outcome = call(*words, "out=more", "drive_by=prefix")
     assert "4.png: pictures of a drive must have the size of its first one, one/2.png, 96x48, got 64x48" in outcome.err
     *_, error = call(*words, "out=none", "drive_by=car").err.splitlines()
-    assert error.startswith("error: drive_by: drive_by must be one of auto, folder, prefix")
+    assert error.startswith("error: drive_by must be one of auto, folder, prefix")

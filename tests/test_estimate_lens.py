@@ -70,7 +70,7 @@ def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("input=raw", "frames=0"), "frames: frames must be at least 1, got 0"),
+        (("input=raw", "frames=0"), "frames must be at least 1, got 0"),
         (("input=raw", "fov_deg=180"), "input: fov_deg must be a number in [1, 170], got 180"),
         (("input=raw", "out=cam.txt"), "out: path must end in .xml, .yml or .yaml, got cam.txt"),
         (("input=nothing",), "input must be a folder, a picture or a video, got nothing, which does not exist"),

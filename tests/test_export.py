@@ -93,10 +93,10 @@ def test_a_model_with_several_passes_is_rejected(call, brighter, monkeypatch):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("out=model.pth", "out: out must be one of .onnx, .pt2, .safetensors, got '.pth'"),
+        ("out=model.pth", "out must be one of .onnx, .pt2, .safetensors, got '.pth'"),
         ("size=72", "size must be HEIGHTxWIDTH, such as 720x1280, got 72"),
         ("size=0x72", "size must be HEIGHTxWIDTH, such as 720x1280, got 0x72"),
-        ("interpolation=cubic", "interpolation: interpolation must be one of nearest, bilinear, bicubic"),
+        ("interpolation=cubic", "interpolation must be one of nearest, bilinear, bicubic"),
         ("ckpt_path=none.ckpt", "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
     ],
 )

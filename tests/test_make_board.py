@@ -51,7 +51,7 @@ def test_every_board_is_detected(call, tmp_path, option, board):
     [
         (("out=board.svg",), "out must end in .pdf or .png, got board.svg"),
         (("out=none/board.pdf",), "none/board.pdf could not be written: No such file or directory"),
-        (("dpi=1",), "dpi: dpi must be a number in [20, 2400], got 1"),
+        (("dpi=1",), "dpi must be a number in [20, 2400], got 1"),
         (("squares=eleven",), "board: squares must be columns x rows, such as 11x8, got 'eleven'"),
         (("board=circles",), "board must be one of charuco, chessboard, got circles"),
     ],

@@ -200,7 +200,7 @@ def test_a_fold_inside_the_frame_is_warned_of(call, folder):
 def test_a_pole_inside_the_frame_raises_before_anything_is_written(call, folder):
     write_opencv(folder / "cam.yaml", Camera(**PINHOLE, coefficients=(0.0,) * 5 + (-3.0, 0.0, 0.0)))
     message = call("rectify", "input=raw", "camera=cam.yaml").message
-    assert message.startswith("camera: camera must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside")
+    assert message.startswith("camera must keep its denominator 1 + k4 r^2 + k5 r^4 + k6 r^6 above zero inside")
     assert not (folder / "rectified").exists()
 
 
@@ -244,7 +244,7 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(ca
             ("input=raw", "camera=short.yaml"),
             "camera: path must hold 4 x 1 numbers as distortion_coefficients, got short.yaml with 3",
         ),
-        (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom: zoom must be a number in [0.05, 20], got 0"),
+        (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (
             ("input=wide.png", "camera=cam.yaml"),

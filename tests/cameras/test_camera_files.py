@@ -217,6 +217,14 @@ def test_a_file_is_read_as_its_program_defines_it(form, tmp_path, make_camera):
     assert read_covariance(tmp_path / name) is None
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("form", ["ROS 2, three messages", "OpenCV", "lists of Python", "VINS"])
+def test_a_file_that_powershell_wrote_in_utf_16_is_read(form, tmp_path, make_camera):
+    name, content, options, lens = FILES[form]
+    (tmp_path / name).write_text(content, encoding="utf-16", newline="\r\n")
+    assert read_camera(tmp_path / name, **options) == make_camera(*lens)
+
+
 def test_a_long_recording_of_equal_messages_is_parsed_once(tmp_path):
     messages = [message(FIVE, "plumb_bob", stamp) for stamp in range(500)]
     assert len(parse_documents(tmp_path, "".join(messages))) == 1

@@ -67,7 +67,7 @@ def test_camera_and_horizon_reach_the_scene_of_each_command(call, folder, comman
     names = ("both", "camera", "horizon", "none")
     assert all(made[a] != made[b] for i, a in enumerate(names) for b in names[:i])
     for words, message in {
-        ("camera=none.yaml",): "No such file or directory: 'none.yaml'",
+        ("camera=none.yaml",): "camera must name what exists, got none.yaml: No such file or directory",
         ("horizon=20",): "horizon must be a number in [-10, 10], got 20",
         (
             "camera=camera.yaml",

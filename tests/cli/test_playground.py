@@ -250,4 +250,4 @@ def test_a_port_in_use_is_one_line_with_another_port(call):
         assert call("playground", f"port={port}").message.startswith(
             f"port must be free, and at most 65535, got {port}"
         )
-    assert call("playground", "port=0").message == "port: port must be at least 1, got 0"
+    assert call("playground", "port=0").message == "port must be at least 1, got 0"

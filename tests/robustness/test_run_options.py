@@ -171,7 +171,7 @@ def test_a_base_whose_pictures_had_other_draws_is_one_line_and_no_table(call, tm
     path.write_text("".join(json.dumps(row) + "\n" for row in [settings, *rows]))
     outcome = call(*RUN, "scene=cape_town_fog", "model=gray:brightness", "out=out", "base=base")
     *_, error = outcome.err.splitlines()
-    assert error.startswith("error: base: base must be of the same draws, by the same seed and version, got a visib")
+    assert error.startswith("error: base must be of the same draws, by the same seed and version, got a visib")
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."] == ["scores.jsonl"]
 
 
@@ -304,10 +304,10 @@ def test_a_run_of_an_earlier_version_without_a_camera_continues(call, tmp_path, 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("camera=lost.yaml",), "camera: "),
-        (("camera=gray.py",), "camera: "),
-        (("horizon=up",), "horizon: horizon must be a real number, got 'up'"),
-        (("horizon=540",), "horizon: horizon must be a number in [-10, 10], got 540"),
+        (("camera=lost.yaml",), "camera must name what exists, got lost.yaml: No such file"),
+        (("camera=gray.py",), "camera: path must hold a camera of OpenCV"),
+        (("horizon=up",), "horizon must be a real number, got 'up'"),
+        (("horizon=540",), "horizon must be a number in [-10, 10], got 540"),
         (
             ("camera=large.yaml",),
             "camera must be that of all frames, got 0.png: image must have the shape of the camera's frames, "
@@ -346,7 +346,7 @@ def test_batches_of_a_picture_give_the_scores_of_single_ones(call, tmp_path, fra
         "error: predict must return a sequence of 4 predictions for as many images, got Tensor of 1; return a list, or "
         "a tensor (4, ...); or set batch_size=1"
     )
-    assert call(*words, "out=none", "batch_size=0").message.startswith("batch_size: batch_size must be at least 1")
+    assert call(*words, "out=none", "batch_size=0").message.startswith("batch_size must be at least 1")
 
 
 # --- the worst pictures of a segmenter

@@ -1,5 +1,6 @@
 """Contents of camera files as plain values: parsers of YAML, JSON and XML, and the checks that the readers share."""
 
+import codecs
 import json
 import re
 import reprlib
@@ -137,11 +138,13 @@ class Document:
 
 
 def read_text(path: Path) -> str:
-    """Read a text in UTF-8, with or without byte order mark."""
+    """Read a text in UTF-8, with or without byte order mark, or in UTF-16 with one, as Windows PowerShell writes it."""
+    data = path.read_bytes()
+    encoding = "utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return data.decode(encoding).replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise ValueError(f"path must hold text in UTF-8, got {path}") from error
+        raise ValueError(f"path must hold text in UTF-8 or UTF-16, got {path}") from error
 
 
 def abbreviate(value: Any) -> str:

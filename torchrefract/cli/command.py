@@ -229,7 +229,10 @@ def naming(part: str) -> Iterator[None]:
     except (*_FILE_ERRORS, ModuleNotFoundError):
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
-        raise UsageError(f"{part}: {error}") from error
+        if isinstance(error, FileNotFoundError) and error.filename:
+            raise UsageError(f"{part} must name what exists, got {error.filename}: {error.strerror}") from error
+        is_named = str(error).startswith(f"{part} must ")
+        raise UsageError(str(error) if is_named else f"{part}: {error}") from error
 
 
 @contextmanager

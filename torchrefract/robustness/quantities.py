@@ -1,8 +1,7 @@
 """The physical quantity by which a scene is stated."""
 
-from collections.abc import Iterable
-from functools import lru_cache
-from typing import Any, cast
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, cast
 
 from torch import Tensor
 
@@ -49,14 +48,19 @@ def _quantity(effect: Effect) -> Quantity | None:
     return _OF_EFFECTS.get(type(effect))
 
 
-@lru_cache
+class _GetOfChild(NamedTuple):
+    """Return the value of a child from the parameters of its composition."""
+
+    child: int
+    get: Callable[[Any], Tensor]
+
+    def __call__(self, params: Any) -> Tensor:
+        return self.get(params.children[self.child])
+
+
 def _of_child(index: int, quantity: Quantity) -> Quantity:
     """Return the quantity of a composition that is that of a child."""
-
-    def get(params: Any) -> Tensor:
-        return quantity.get(params.children[index])
-
-    return quantity._replace(get=get)
+    return quantity._replace(get=_GetOfChild(index, quantity.get))
 
 
 # Of torchrefract.presets.

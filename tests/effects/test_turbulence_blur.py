@@ -23,8 +23,7 @@ def blur_of(image: Tensor, depth: Tensor | float, *, cn2: float = CN2, **options
     """Return the linear light of frames with a focal length of 400 widths behind air of one Cn2 everywhere."""
     given: dict[str, Any] = {"height": None, "focal": 400.0, "aperture": APERTURE, "wavelength": WAVELENGTH}
     effect = TurbulenceBlur(cn2_range=(cn2, cn2), reach=REACH, tolerance=None, **given | options)
-    if isinstance(depth, float):
-        depth = torch.full_like(image[:, :1], depth)
+    depth = torch.as_tensor(depth, dtype=image.dtype).expand(1, 1, *image.shape[2:])
     return srgb_to_linear(effect.degrade(image, seed=1, depth=depth).image)
 
 

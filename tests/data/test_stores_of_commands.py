@@ -141,8 +141,8 @@ def test_a_run_of_degrade_in_a_bucket_that_is_killed_continues_to_the_bytes_on_d
 ):
     server, bucket = request.getfixturevalue(protocol), f"{protocol}://bucket"
     store: Any = as_path(bucket)
-    store.fs.put(str(frames), "bucket/frames", recursive=True)
-    words = ("scene=paper_refractive", f"source={bucket}/frames", f"out={bucket}/fog", "workers=1")
+    store.fs.put(str(frames), "bucket/raw", recursive=True)
+    words = ("scene=paper_refractive", f"source={bucket}/raw", f"out={bucket}/fog", "workers=1")
     command = [sys.executable, "-m", "torchrefract.degrade", *words]
     with subprocess.Popen(command, env=os.environ | server | {"PYTHONPATH": str(ROOT)}) as run:
         end = time.monotonic() + 120

@@ -44,7 +44,7 @@ def worst_case(
     *,
     steps: int = 20,
     restarts: int = 2,
-    lr: float = 0.1,
+    lr: float = 0.5,
     seed: int = 0,
     keys: Tensor | Sequence[int] | None = None,
     depth: Tensor | Callable[[Tensor], Tensor] | None = None,

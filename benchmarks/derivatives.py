@@ -65,6 +65,7 @@ PHOTOMETRIC: dict[str, Callable[[], Effect]] = {
     "sun glare": lambda: tr.SunGlare(**_SUN),
     "exposure": lambda: tr.Exposure(shot_range=(0.001, 0.01), read_range=(0.001, 0.01), time_constant_range=(1.0, 2.0)),
     "night glow": tr.NightGlow,
+    "turbulence blur": partial(tr.TurbulenceBlur, cn2_range=(1e-10, 3e-10), aperture=0.05, focal=20.0, height=None),
     "vignetting": tr.Vignetting,
     "chromatic aberration": lambda: tr.ChromaticAberration(red_range=(0.01, 0.02), blue_range=(-0.02, -0.01)),
 }

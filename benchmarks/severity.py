@@ -123,7 +123,7 @@ def quantity(effect: Any) -> str:
             low, high = (factor * end for end in getattr(part, name, (0.0, 0.0)))
             if high or low:
                 texts.append(f"{low:.4g} … {high:.4g} {unit}" if low != high else f"{low:.4g} {unit}")
-    return "; ".join(texts)
+    return "; ".join(dict.fromkeys(texts))  # two effects of one air have one Cn2
 
 
 def measure(effect: Effect, frames: list[Tensor], depths: Sequence[Tensor | None]) -> tuple[Score, float]:

@@ -58,6 +58,9 @@ PHOTOMETRIC: dict[str, Callable[..., Any]] = {
     "sun glare": partial(tr.SunGlare, center_x_range=(0.3, 0.7), center_y_range=(0.1, 0.3)),
     "exposure": tr.Exposure,
     "night glow": tr.NightGlow,
+    "turbulence blur": partial(
+        tr.TurbulenceBlur, cn2_range=(1e-11, 1e-11), focal=4.0, depth=tr.GroundPlaneDepth(focal=4.0)
+    ),
 }
 
 

@@ -50,6 +50,7 @@ SETTINGS = {
     "unpaved_road": Setting(road=9),
     "PhysicalTurbulence": Setting(detail=(0.6, 0.4, 3)),
     "RoadMirage": Setting(road=13, detail=(0.5, 0.48, 3), arguments={"horizon": 0.452, "vanishing": 0.56}),
+    "TurbulenceBlur": Setting(detail=(0.6, 0.4, 3)),
     "RollingShutter": Setting(arguments={"readout_range": [60.0, 60.0], "yaw_range": [1.0, 1.0]}),
     "SunGlare": Setting(road=5),
     "NightGlow": Setting(road=10, detail=(0.6, 0.6, 2), night=True, arguments={"threshold": 0.5}),

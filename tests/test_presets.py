@@ -26,6 +26,7 @@ from torchrefract import (
     SunGlare,
     ThinPlateSpline,
     Turbulence,
+    TurbulenceBlur,
     UniformFog,
     presets,
 )
@@ -45,7 +46,7 @@ EFFECTS = {
     "night_fog": {HeterogeneousFog, NightGlow},
     "limpopo_sun_glare": {SunGlare},
     "highveld_heat_haze": {RoadMirage, Turbulence},
-    "highveld_telephoto": {PhysicalTurbulence},
+    "highveld_telephoto": {PhysicalTurbulence, TurbulenceBlur},
     "unpaved_road": {HeterogeneousFog, Turbulence, RollingShutter},
     "paper_refractive": {LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree},
     "paper_weather": {UniformFog, HeterogeneousFog, LensFlare},

@@ -3,6 +3,7 @@
 Effects, each an `nn.Module` from images to images; in parentheses what they show:
     LensDistortion (a lens), Turbulence (heat haze), PhysicalTurbulence (heat haze by Cn2 and depth), RoadMirage,
     ThinPlateSpline and DivergenceFree (smooth random warps), Rectification (removes the lens of a calibrated camera),
+    TurbulenceBlur (what the air blurs), BlurredTurbulence (what it moves and blurs),
     RollingShutter (rows that a moving, shaking camera exposes one after the other),
     UniformFog, HeterogeneousFog, LensFlare, Vignetting (dark corners), ChromaticAberration (colored edges),
     SunGlare (the sun, its glare and ghosts, and a camera that exposes for it), Exposure (gain, noise and clipping),
@@ -48,6 +49,7 @@ from torchrefract.effects.rolling_shutter import RollingShutter, RollingShutterP
 from torchrefract.effects.sun_glare import SunGlare, SunGlareParams
 from torchrefract.effects.thin_plate import ThinPlateParams, ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence, TurbulenceParams
+from torchrefract.effects.turbulence_blur import BlurredTurbulence, TurbulenceBlur, TurbulenceBlurParams
 from torchrefract.effects.vignetting import Vignetting, VignettingParams
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import (
@@ -75,6 +77,7 @@ from torchrefract.warping.warp import warp
 __version__ = "0.2.0"
 
 __all__ = [
+    "BlurredTurbulence",
     "Camera",
     "ChromaticAberration",
     "ChromaticAberrationParams",
@@ -115,6 +118,8 @@ __all__ = [
     "ThinPlateParams",
     "ThinPlateSpline",
     "Turbulence",
+    "TurbulenceBlur",
+    "TurbulenceBlurParams",
     "TurbulenceParams",
     "UniformFog",
     "Vignetting",

@@ -49,6 +49,7 @@ from torchrefract.effects.rolling_shutter import RollingShutter
 from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.effects.thin_plate import ThinPlateSpline
 from torchrefract.effects.turbulence import Turbulence
+from torchrefract.effects.turbulence_blur import BlurredTurbulence
 from torchrefract.fields.corridor import CorridorDepth
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.labels.vehicles import VEHICLES
@@ -204,20 +205,24 @@ def highveld_telephoto(
     camera: _CameraSource = None,
     horizon: float = _HORIZON,
     depth: _DepthSource = None,
+    blur: dict[str, Any] | None = None,
     **arguments: Any,
-) -> PhysicalTurbulence:
+) -> BlurredTurbulence:
     """Create the heat haze of `highveld_heat_haze` as a camera with a long lens sees it, by its physics.
 
     Args:
-        severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day.
+        severity: 1 to 5, Cn2 of 1e-13, 3e-13, 1e-12, 3e-12, 1e-11 m^(-2/3), each +-50 %. 1e-12 is a hot day. The
+            aperture over Fried's parameter, D / r0 at 1 km, is up to 0.25, 0.48, 0.99, 1.9, 3.9: below 1 the air blurs
+            nothing that the aperture of 2 mm shows, so severities 1 to 3 are not blurred.
         camera, horizon, depth: as for all scenes; without a camera, frames have a focal length of 4 widths.
+        blur: `wavelength` and `tolerance` of `BlurredTurbulence`.
         arguments: of `PhysicalTurbulence`, and those of all scenes.
     """
     cn2 = _at_severity(severity, [1e-13, 3e-13, 1e-12, 3e-12, 1e-11])
     place = _place(camera, horizon, depth, focal=_TELEPHOTO_FOCAL)
     options: dict[str, Any] = {"cn2_range": (0.5 * cn2, 1.5 * cn2), "horizon": horizon, "focal": _TELEPHOTO_FOCAL}
     options |= _focal(place["camera"]) | place
-    return PhysicalTurbulence(**options | _without_place(arguments))
+    return BlurredTurbulence(PhysicalTurbulence(**options | _without_place(arguments)), **dict(blur or {}))
 
 
 def unpaved_road(

@@ -14,7 +14,10 @@ from torchrefract.effects.base import Effect
 
 CAMERA = tr.Camera(width=80, height=64, fx=70, fy=70, cx=39.5, cy=31.5, coefficients=(-0.1, 0.01, 0, 0))
 CLASSES = [kind for name in tr.__all__ if inspect.isclass(kind := getattr(tr, name)) and issubclass(kind, Effect)]
-ARGUMENTS: dict[Any, tuple[Any, ...]] = {tr.Compose: ([],), tr.OneOf: ([],), tr.Rectification: (CAMERA,)}
+ARGUMENTS: dict[Any, tuple[Any, ...]] = {
+    **{tr.Compose: ([],), tr.OneOf: ([],), tr.Rectification: (CAMERA,)},
+    tr.BlurredTurbulence: (tr.PhysicalTurbulence(p=0.5),),
+}
 
 
 @pytest.mark.quick

@@ -85,6 +85,7 @@ def test_a_moved_slider_fixes_its_parameter_and_leaves_the_draws_of_the_others(t
         ("unpaved_road", "speed", 120),
         ("paper_refractive", "k1", -0.5),
         ("PhysicalTurbulence", "cn2", -9.5),
+        ("highveld_telephoto", "cn2", -10.5),
         ("SunGlare", "center x", 0.9),
     ],
 )

@@ -23,6 +23,7 @@ from torchrefract import (
     SunGlare,
     ThinPlateSpline,
     Turbulence,
+    TurbulenceBlur,
     UniformFog,
     Vignetting,
 )
@@ -30,6 +31,7 @@ from torchrefract import (
 KINDS = (
     *(ChromaticAberration, DivergenceFree, Exposure, HeterogeneousFog, LensDistortion, LensFlare, NightGlow),
     *(PhysicalTurbulence, RoadMirage, RollingShutter, SunGlare, ThinPlateSpline, Turbulence, UniformFog, Vignetting),
+    TurbulenceBlur,
 )
 ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (ChromaticAberration, {"red_range": (0.0, 0.2)}, "red_range must"),
@@ -98,6 +100,9 @@ ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (UniformFog, {"airlight": (0.5, math.nan, 0.5)}, "airlight must"),
     (UniformFog, {"airlight": 1.1}, "airlight must"),
     (UniformFog, {"airlight": "sky"}, "airlight must"),
+    (TurbulenceBlur, {"aperture": 0.0}, "aperture must be"),
+    (TurbulenceBlur, {"wavelength": 550.0}, "wavelength must be"),
+    (TurbulenceBlur, {"reach": 0.0}, "reach must be"),
     (UniformFog, {"deviation_range": (-1.0, 0.0)}, "deviation_range must"),
     (UniformFog, {"deviation_range": (0.0, 1.0)}, "deviation_range must"),
     (UniformFog, {"threshold": 0.0}, "threshold must"),
@@ -115,6 +120,7 @@ TYPES: list[tuple[type, dict[str, Any], str]] = [
     (SunGlare, {"camera": 3}, "camera must be a Camera, got int"),
     (ThinPlateSpline, {"lattice": (2.5, 4)}, "lattice must be a whole number"),
     (Turbulence, {"depth": 3.0}, "depth must be a provider"),
+    (TurbulenceBlur, {"depth": 3.0}, "depth must be a provider"),
     (Vignetting, {"camera": 1.0}, "camera must be a Camera"),
 ]
 PARAMS: list[tuple[type, str, float, str]] = [
@@ -137,6 +143,7 @@ PARAMS: list[tuple[type, str, float, str]] = [
     (Turbulence, "length", math.nan, "not be NaN"),
     (Turbulence, "amplitude", -1.0, r"lie in \[0, 10000\]"),
     (Turbulence, "aperture", math.inf, r"lie in \[0, 10000\]"),
+    (TurbulenceBlur, "ratio", -1.0, r"lie in \[0, 1e\+15\]"),
     (UniformFog, "visibility", 0.0, "be above 0"),
     (UniformFog, "deviation", -1.0, "be above -1"),
     (UniformFog, "airlight", 1.01, r"lie in \[0, 1\]"),
@@ -147,6 +154,7 @@ SHAPES: list[tuple[type, dict[str, torch.Tensor], str]] = [
     (RoadMirage, {"rate": torch.zeros(2, 3)}, r"params.rate must have shape \(B, 6\)"),
     (ThinPlateSpline, {"displacement": torch.zeros(2, 3, 2)}, r"params\.displacement must have the shape of points"),
     (ThinPlateSpline, {"points": torch.zeros(2, 16)}, r"params\.points must have shape \(B, N, 2\)"),
+    (TurbulenceBlur, {"ratio": torch.ones(2, 1)}, r"params\.ratio must have shape \(B,\)"),
     (Turbulence, {"length": torch.ones(2, 1)}, r"params\.length must have shape \(B,\)"),
     (Turbulence, {"key": torch.zeros(2, 3, dtype=torch.int64)}, r"params\.key must be \(B, 4\) of int64"),
 ]

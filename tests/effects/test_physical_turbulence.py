@@ -160,7 +160,7 @@ def test_air_that_thins_with_height_gives_rays_to_the_road_twice_the_variance():
     for air, road in ((Air(0.1, 1e-4, 1e6), 2.0), (Air(1e-4, 0.05, 1e6), 1.8)):
         layers = layers_of(500.0, 4, air)
         ends = [0.0, 0.01, 0.3, 1.0, 5.0, 100.0, 1e4]
-        gains = height_gain(torch.tensor(ends, dtype=torch.float64), layers).square().tolist()
+        gains = height_gain(torch.tensor(ends, dtype=torch.float64), layers.gains).square().tolist()
         m = layers.exponent
         for end, gain in zip(ends, gains, strict=True):
             exact, _ = integrate.quad(
@@ -271,7 +271,7 @@ def test_fried_s_parameter_is_that_of_quadrature(cn2, distance):
 def test_the_plan_says_where_a_short_exposure_would_be_blurred():
     for aperture, cn2, ratio in ((0.002, 1e-12, None), (0.002, 1e-11, "3.1"), (0.05, 1e-12, "19.4")):
         effect = PhysicalTurbulence(cn2_range=(0.0, cn2), aperture=aperture)
-        left_out = f"the blur of short exposures is left out, D / r0 is up to {ratio}"
+        left_out = f"BlurredTurbulence blurs short exposures too, D / r0 is up to {ratio}"
         assert (left_out in str(effect.plan(1080, 1920))) == (ratio is not None)
         assert (effect.blur_ratio > 1) == (ratio is not None)
 

@@ -111,6 +111,18 @@ DOMAINS = {
         {"cn2_range": (0.0, 1e-9), "wind_x_range": (-100.0, 100.0), "wind_y_range": (-100.0, 100.0)},
         {**_WARP_OPTIONS, "num_layers": st.integers(3, 8), "depth": _FOG_OPTIONS["depth"]},
     ),
+    "turbulence blur": Domain(
+        tr.TurbulenceBlur,
+        {"cn2_range": (0.0, 1e-4)},
+        {
+            "aperture": st.floats(1e-4, 10.0),
+            "wavelength": st.floats(1e-7, 1e-4),
+            "reach": st.floats(1.0, 1e6),
+            "height": st.sampled_from([None, 1.3]),
+            "tolerance": st.sampled_from([None, 0.5]),
+            "depth": _FOG_OPTIONS["depth"],
+        },
+    ),
     "road mirage": Domain(
         tr.RoadMirage,
         {

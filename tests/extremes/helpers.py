@@ -32,6 +32,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.05)),
     "sun glare": tr.SunGlare,
     "night glow": tr.NightGlow,
+    "turbulence blur": partial(tr.TurbulenceBlur, cn2_range=(1e-11, 1e-10), focal=50.0),
     "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
     "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),

@@ -50,7 +50,7 @@ LIGHTS: dict[str, Callable[..., Effect]] = {
     "sun glare": partial(tr.SunGlare, center_x_range=(0.2, 0.8), center_y_range=(0.1, 0.6), gamma_range=(0.0, 0.0)),
     "exposure": partial(tr.Exposure, gamma_range=(0.0, 0.0), shot_range=(1e-4, 1e-3)),
     "plume": partial(tr.HeterogeneousFog, mode="ray", visibility_range=(20.0, 60.0), scale_height_range=(1.0, 3.0)),
-    "night glow": tr.NightGlow,  # no pixel is a lamp, whose light spreads
+    "night glow": tr.NightGlow,  # no pixel is a lamp, whose light spreads; blur has a test of its own
     "vignetting": tr.Vignetting,
     "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.02), blue_range=(-0.02, -0.02)),
 }

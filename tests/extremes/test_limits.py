@@ -56,6 +56,7 @@ IDENTITIES: dict[str, Callable[..., Effect]] = {
     "thin-plate spline, amplitude 0": partial(tr.ThinPlateSpline, amplitude_range=ZERO),
     "divergence-free, amplitude 0": fields(tr.DivergenceFree, 0.0),
     "physical turbulence, Cn2 = 0": partial(tr.PhysicalTurbulence, cn2_range=ZERO),
+    "turbulence blur, Cn2 = 0": partial(tr.TurbulenceBlur, cn2_range=ZERO, tolerance=None),
     "road mirage, dT = 0": partial(tr.RoadMirage, difference_range=ZERO),
     "uniform fog, V = inf": partial(tr.UniformFog, **CLEAR),
     "heterogeneous fog, V = inf": partial(tr.HeterogeneousFog, **CLEAR),

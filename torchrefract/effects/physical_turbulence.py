@@ -79,8 +79,9 @@ class PhysicalTurbulence(WarpEffect):
 
     Sizes: with f = 1400 px and an aperture of 2 mm, Cn2 = 1e-12 moves what is 200 m away by 0.05 px, and 1e-11 what is
     300 m away by 0.19 px. Displacements of 0.5 to 3 px are those of telephoto lenses; `Turbulence` exaggerates them for
-    others, see its `equivalent_cn2`. The blur of short exposures is left out. It is invisible where the aperture D is
-    smaller than Fried's parameter r0: at 2 mm up to a Cn2 of 1e-12 over 1 km. The plan states D / r0 above 1.
+    others, see its `equivalent_cn2`. The air blurs short exposures too, which `BlurredTurbulence` adds. This blur is
+    invisible where the aperture D is smaller than Fried's parameter r0: at 2 mm up to a Cn2 of 1e-12 over 1 km. The
+    plan states D / r0 above 1.
 
     Args:
         cn2_range: m^(-2/3), at the height of the camera; its root is drawn uniformly. 1e-14 is weak, 1e-12 a hot day.
@@ -147,10 +148,12 @@ class PhysicalTurbulence(WarpEffect):
         self.num_layers = check_count("num_layers", num_layers, low=3)
         if self.num_layers > 8:
             raise ValueError(f"num_layers must be at most 8, got {num_layers}")
-        self.depth = self._road() if depth is None else check_depth_provider(depth)
+        if depth is None:
+            depth = road_depth(self.camera, focal=self.focal, height=self.height, horizon=self.horizon)
+        self.depth = check_depth_provider(depth)
         self._layers = layers_of(self.reach, self.num_layers, self._air)
-        sigma = 1e6 * math.sqrt(tilt_variance(self.reach, self._air))
-        low, high = (min(sigma * math.sqrt(end), _LARGEST_TILT) for end in self.cn2_range)
+        self._tilt_of_unit = 1e6 * math.sqrt(tilt_variance(self.reach, self._air))
+        low, high = (min(self._tilt_of_unit * math.sqrt(end), _LARGEST_TILT) for end in self.cn2_range)
         self._tilts = low, high
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> PhysicalTurbulenceParams:
@@ -192,7 +195,7 @@ class PhysicalTurbulence(WarpEffect):
         scale = finite_or(air.tilt, 0.0).clamp(-_LARGEST_TILT, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
         if self.height is not None:
             below = (points.y - (self.horizon * height - 0.5)) / focal[1]
-            scale = scale * height_gain(1 - depth * below / self.height, self._layers)
+            scale = scale * height_gain(1 - depth * below / self.height, self._layers.gains)
         flow = torch.cat([u * (scale * focal[0]), v * (scale * focal[1])], dim=1)
         return flow, everywhere(flow.device)
 
@@ -205,9 +208,13 @@ class PhysicalTurbulence(WarpEffect):
     def blur_ratio(self) -> float:
         """Return D / r0 at the reach in the strongest air of the range, by `fried_parameter`.
 
-        Above 1 a short exposure would be blurred more than the aperture blurs it; this blur is left out.
+        Above 1 the air blurs a short exposure more than the aperture does; `BlurredTurbulence` adds this blur.
         """
         return self.aperture / fried_parameter(self.cn2_range[1], self.reach)
+
+    def root_cn2(self, params: PhysicalTurbulenceParams) -> Tensor:
+        """Return the root of the Cn2 of parameters, (B,), m^(-1/3)."""
+        return params.tilt / self._tilt_of_unit
 
     def equivalent_amplitude(self, width: int, *, distance: float | None = None) -> Range:
         """Return the displacement, px, of what is a distance away in frames of a width, for the ends of `cn2_range`.
@@ -225,11 +232,6 @@ class PhysicalTurbulence(WarpEffect):
     @property
     def _air(self) -> Air:
         return Air(self.aperture, self.inner_scale, self.outer_scale)
-
-    def _road(self) -> GroundPlaneDepth:
-        focal = focal_px(self.camera, 1, focal=self.focal)
-        height = 1.3 if self.height is None else self.height
-        return GroundPlaneDepth(camera_height=height, focal=focal, horizon=self.horizon, far=math.inf)
 
     def _shift(self, params: PhysicalTurbulenceParams) -> Tensor | None:
         """Return (N, 2), m: how far the wind has moved the air, or None if it has not."""
@@ -268,13 +270,23 @@ class _TurbulenceBounds:
         """Leave nothing out."""
         why = "each pixel has a ray of its own"
         if self.blur_ratio > 1:
-            why += f"; the blur of short exposures is left out, D / r0 is up to {self.blur_ratio:.1f}"
+            why += f"; BlurredTurbulence blurs short exposures too, D / r0 is up to {self.blur_ratio:.1f}"
         return Simplification(0.0, can_interpolate=False, why=why)
 
     def contains(self, params: PhysicalTurbulenceParams) -> Tensor:
         """Return (), bool: the tilt lies in the range, up to rounding."""
         low, high = self.tilt
         return ((params.tilt >= low * (1 - 1e-5)) & (params.tilt <= high * (1 + 1e-5))).all()
+
+
+def road_depth(camera: Camera | None, *, focal: float, height: float | None, horizon: float) -> GroundPlaneDepth:
+    """Return the depth of a flat road; arguments as for `PhysicalTurbulence`."""
+    return GroundPlaneDepth(
+        camera_height=1.3 if height is None else height,
+        focal=focal_px(camera, 1, focal=focal),
+        horizon=horizon,
+        far=math.inf,
+    )
 
 
 def focal_px(camera: Camera | None, width: int, *, focal: float = UNKNOWN_FOCAL) -> float:

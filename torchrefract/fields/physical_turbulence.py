@@ -14,7 +14,7 @@ parameter near the ground", JOSA 61 (1971), for the decrease with height.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -86,7 +86,8 @@ def fried_parameter(cn2: float, distance: float, *, wavelength: float = GREEN) -
 
         r0 = (0.423 k^2 int_0^L Cn2 (1 - s/L)^(5/3) ds)^(-3/5) = (0.423 k^2 Cn2 L 3/8)^(-3/5),  k = 2 pi / wavelength
 
-    An aperture D blurs short exposures by diffraction alone while D / r0 is below about 1.
+    An aperture D blurs short exposures by diffraction alone while D / r0 is below about 1; see
+    `torchrefract.fields.turbulence_blur`.
 
     Args:
         cn2: m^(-2/3), at least 0.
@@ -112,7 +113,7 @@ def layers_of(reach: float, count: int, air: Air) -> Layers:
         distances.append(float(np.average(np.cbrt(s), weights=weight) ** 3))
         apertures.append(float(air.aperture * (1 - np.average(s, weights=weight) / reach)))
     strengths = [_strength(air._replace(aperture=aperture)) for aperture in apertures]
-    return Layers(edges, tuple(distances), tuple(apertures), tuple(strengths), air, exponent, tuple(_gains(exponent)))
+    return Layers(edges, tuple(distances), tuple(apertures), tuple(strengths), air, exponent, height_gains(exponent))
 
 
 def layer_shares(depth: Tensor, layers: Layers) -> list[Tensor]:
@@ -134,7 +135,7 @@ def layer_shares(depth: Tensor, layers: Layers) -> list[Tensor]:
     return [_root(share * (near - far)) for near, far in pairwise(powers)]
 
 
-def height_gain(end_height: Tensor, layers: Layers) -> Tensor:
+def height_gain(end_height: Tensor, gains: Sequence[float]) -> Tensor:
     """Return the standard deviation of the angle of arrival relative to that of a level ray.
 
         gain^2 = m int_0^1 x^(m - 1) (e + (1 - e) x)^(-4/3) dx
@@ -143,14 +144,14 @@ def height_gain(end_height: Tensor, layers: Layers) -> Tensor:
 
     Args:
         end_height: e, of the end of each ray, in heights of the camera, of any shape; below 0 counts as 0.
-        layers: with the exponent m and the table of gains.
+        gains: the table of `height_gains` for m.
     """
-    gains = as_device_tensor(layers.gains, dtype=end_height.dtype, device=end_height.device)
+    table = as_device_tensor(gains, dtype=end_height.dtype, device=end_height.device)
     # The gain is smooth in 1 / (1 + e^(1/3)).
     place = (_NUM_GAINS - 1) / (1 + _power(end_height, 1 / 3))
     low = place.detach().floor().clamp(0, _NUM_GAINS - 2)
     index = low.long().flatten()
-    near, far = (gains.index_select(0, index + step).view_as(place) for step in (0, 1))
+    near, far = (table.index_select(0, index + step).view_as(place) for step in (0, 1))
     return near + (far - near) * (place - low)
 
 
@@ -258,8 +259,8 @@ def _exponent(air: Air) -> float:
 
 
 @lru_cache(maxsize=64)
-def _gains(exponent: float) -> list[float]:
-    """Return the table of `height_gain` over 1 / (1 + e^(1/3)) from 0 to 1."""
+def height_gains(exponent: float) -> tuple[float, ...]:
+    """Return the table of `height_gain` for the exponent m, over 1 / (1 + e^(1/3)) from 0 to 1."""
     y, weight = np.polynomial.legendre.leggauss(64)
     y, weight = (y + 1) / 2, weight / 2
     z = np.linspace(0, 1, _NUM_GAINS)

@@ -130,9 +130,7 @@ class FogErrorModel:
         if not self.linear_light:
             return LEVELS * error
         light = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in self.colors]
-        x = error * max(max(value, 1 - value) for value in light)
-        # The curve is concave, so two values apart by x come out apart by its value at x at most.
-        return LEVELS * max(error, _STEEPEST_SRGB * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055)
+        return max(LEVELS * error, _levels_of_light(error * max(max(value, 1 - value) for value in light)))
 
 
 @cached_constant(maxsize=64)
@@ -255,6 +253,30 @@ def _deviation_of_mean(model: FogErrorModel, octaves: Sequence[int], request: Ph
     return _SIGMAS * math.sqrt(
         sum(model.weights[i] ** 2 * noise_mean_variance(model.periods[i], *frame) for i in octaves)
     )
+
+
+def plan_turbulence_blur(change: float, ratio: float, request: PhotometricRequest) -> PhotometricPlan:
+    """Plan the blur of turbulence: all of it or, if the aperture hides it, nothing.
+
+    Args:
+        change: largest change of the image, linear light.
+        ratio: largest D / r0.
+        request: the frame and the tolerance.
+    """
+    if request.tolerance is None:
+        return exact_plan(request)
+    budget, levels = request.remaining(linear_light=True), _levels_of_light(min(change, 1.0))
+    name, reason = "blur", f"D / r0 is up to {ratio:.2g} at the reach"
+    if ratio < 1 and levels > budget:
+        name, budget = "blur of frames that are sharper than their aperture", math.inf
+        reason += ": below 1 the diffraction of the aperture hides the blur"
+    return _identity_if_unseen(levels, budget, request, name=name, reason=reason) or exact_plan(request, reason)
+
+
+def _levels_of_light(x: float) -> float:
+    """Return the largest change of the image in levels for a change of its linear light."""
+    # The curve is concave, so two values apart by x come out apart by its value at x at most.
+    return LEVELS * (_STEEPEST_SRGB * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 def in_ranges(values: Tensor, ranges: Sequence[Range]) -> Tensor:

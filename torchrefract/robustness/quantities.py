@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, cast
 from torch import Tensor
 
 from torchrefract.effects.base import Effect
-from torchrefract.effects.compose import Compose
+from torchrefract.effects.compose import Compose, OneOf
 from torchrefract.effects.fog import UniformFog
 from torchrefract.effects.heterogeneous_fog import HeterogeneousFog
 from torchrefract.effects.lens import LensDistortion
@@ -40,7 +40,7 @@ def quantity_of(effects: Iterable[Effect]) -> Quantity | None:
 def _quantity(effect: Effect) -> Quantity | None:
     if effect.p < 1:
         return None
-    if type(effect) is Compose:
+    if isinstance(effect, Compose) and not isinstance(effect, OneOf):
         quantities = ((i, _quantity(child)) for i, child in enumerate(cast(Iterable[Effect], effect.effects)))
         return next((_of_child(i, quantity) for i, quantity in quantities if quantity), None)
     if isinstance(effect, LensDistortion) and (effect._source or max(cast(Range, effect.k1_range)) > 0):
@@ -70,6 +70,6 @@ QUANTITIES = {
     "night_fog": _of_child(0, _VISIBILITY),
     "limpopo_sun_glare": _OF_EFFECTS[SunGlare],
     "highveld_heat_haze": _of_child(0, _OF_EFFECTS[RoadMirage]),
-    "highveld_telephoto": _OF_EFFECTS[PhysicalTurbulence],
+    "highveld_telephoto": _of_child(0, _OF_EFFECTS[PhysicalTurbulence]),
     "unpaved_road": _of_child(0, _VISIBILITY),
 }

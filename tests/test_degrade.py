@@ -1,6 +1,11 @@
 """The command `degrade`: pictures and videos of a keyed draw, resumable, in processes."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -82,6 +87,24 @@ def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder)
     assert {name: (folder / "out" / name).read_bytes() for name in NAMES} == complete
     message = call("degrade", *WORDS, "severity=3").message
     assert message.startswith("out must be a folder of the same configuration, got out, where scene.severity is 4")
+
+
+def test_ctrl_c_while_the_processes_start_is_one_line(folder):
+    command = [sys.executable, "-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, start_new_session=True, **options) as process:
+        try:
+            end = time.monotonic() + 120
+            while not (folder / "later").exists() and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.02)
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
+            _, message = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    lines = [line for line in message.splitlines() if not line.startswith(("warning: ", "torchrefract: loading"))]
+    assert lines == ["stopped; the same command continues"]
 
 
 def test_displacements_scale_with_the_width_of_each_picture_unless_a_width_is_given(call, folder):

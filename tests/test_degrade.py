@@ -98,6 +98,7 @@ def test_ctrl_c_while_the_processes_start_is_one_line(folder):
             end = time.monotonic() + 120
             while not (folder / "later").exists() and process.poll() is None and time.monotonic() < end:
                 time.sleep(0.02)
+            time.sleep(1)  # the server of the processes imports the package, which takes seconds
             os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
             _, message = process.communicate(timeout=60)
         finally:

@@ -42,7 +42,9 @@ def assert_independent_of_batch(effect: Effect, image: Tensor, keys: list[int]) 
 def test_every_public_effect_has_a_domain():
     kinds = {kind for kind in vars(tr).values() if isinstance(kind, type) and issubclass(kind, Effect)}
     # Compositions and rectifications have no ranges.
-    assert kinds - {tr.Compose, tr.OneOf, tr.Rectification} == {domain.kind for domain in DOMAINS.values()}
+    assert kinds - {tr.BlurredTurbulence, tr.Compose, tr.OneOf, tr.Rectification} == {
+        domain.kind for domain in DOMAINS.values()
+    }
 
 
 @small

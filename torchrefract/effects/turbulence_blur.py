@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_number, check_range, check_within, eager_bool, finite_or
+from torchrefract._validation import check_number, check_range, check_within, eager_bool, finite_or, requires_grad
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.compose import Compose, ComposeParams
@@ -140,6 +140,11 @@ class TurbulenceBlur(PhotometricEffect):
     def params_in_range(self, params: TurbulenceBlurParams) -> Tensor:
         """Return (), bool: the air is no stronger than that of the range."""
         return in_ranges(params.ratio[:, None], [(0.0, self._highest_ratio)])
+
+    def may_change(self, params: TurbulenceBlurParams) -> bool:
+        """Return False, too, where the plan drops the blur of the whole range, so that no depth is computed for it."""
+        is_hidden = self.tolerance is not None and self._highest_ratio < 1 and not requires_grad(params)
+        return not is_hidden and super().may_change(params)
 
     def for_params(self, params: TurbulenceBlurParams, height: int, width: int) -> "TurbulenceBlur":
         """Return this effect, or an exact one for stronger air if parameters lie outside the range."""

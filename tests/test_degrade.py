@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -92,8 +93,11 @@ def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder)
 def test_ctrl_c_while_the_processes_start_is_one_line(folder):
     command = [sys.executable, "-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, start_new_session=True, **options) as process:
+    options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    options["preexec_fn"] = partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # a shell ignores it in the background
+    with subprocess.Popen(command, **options) as process:
         try:
             end = time.monotonic() + 120
             while not (folder / "later").exists() and process.poll() is None and time.monotonic() < end:

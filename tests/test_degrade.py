@@ -94,9 +94,8 @@ def test_ctrl_c_while_the_processes_start_is_one_line(folder):
     command = [sys.executable, "-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    options["preexec_fn"] = partial(
-        signal.signal, signal.SIGINT, signal.SIG_DFL
-    )  # a shell ignores it in the background
+    # A shell lets programs in the background ignore it.
+    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(command, **options) as process:
         try:
             end = time.monotonic() + 120

@@ -10,8 +10,7 @@ from torchrefract.restoration.bridge import Bridge
 from torchrefract.restoration.models.denoiser import Denoiser
 from torchrefract.restoration.tasks import Deweather, Undistort
 
-# Lightning warns of small trainings, and of its own code (LeafSpec).
-pytestmark = pytest.mark.filterwarnings(
+pytestmark = pytest.mark.filterwarnings(  # Lightning warns of small trainings, and of its own code (LeafSpec)
     "ignore:.*does not have many workers", "ignore:.*no `val_dataloader", "ignore:.*LeafSpec"
 )
 

@@ -15,8 +15,8 @@ from torchrefract.robustness.predictors import load_predictor
 
 # Of TorchScript and of its exporter for ONNX, which people still have.
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:.*deprecated"),
-    pytest.mark.filterwarnings("ignore:You are using the legacy TorchScript-based ONNX export"),
+    pytest.mark.filterwarnings("ignore:.*deprecated"),  # PyTorch's, of torch.jit
+    pytest.mark.filterwarnings("ignore:You are using the legacy TorchScript-based ONNX export"),  # PyTorch's
 ]
 SIZE = (72, 128)
 NAMES = ["boxes", "scores", "labels"]  # the order of SSD
@@ -26,7 +26,9 @@ NAMES = ["boxes", "scores", "labels"]  # the order of SSD
 def detector() -> nn.Module:
     """Return a detector of torchvision with a tiny backbone and random weights."""
     detection = pytest.importorskip("torchvision.models.detection.ssd", reason="torchvision is in the extra train")
-    anchors = pytest.importorskip("torchvision.models.detection.anchor_utils")
+    anchors = pytest.importorskip(
+        "torchvision.models.detection.anchor_utils", reason="torchvision is in the extra train"
+    )
     torch.manual_seed(0)
     layers = [nn.Conv2d(3, 8, 3, 2, 1), nn.ReLU(), nn.Conv2d(8, 8, 3, 2, 1), nn.ReLU(), nn.Conv2d(8, 8, 3, 2, 1)]
     backbone = nn.Sequential(*layers)

@@ -59,7 +59,8 @@ class TurbulenceBlur(PhotometricEffect):
     exposure is so short that the air stands still, some milliseconds. Where it also moves what is seen, see
     `BlurredTurbulence` for both with one Cn2.
 
-    `valid` are the finite pixels; others count as black.
+    `valid` are the finite pixels; others count as black. In still air, and where D / r0 below 1 hides the blur, every
+    pixel keeps its value and is valid.
 
     Args:
         cn2_range: m^(-2/3), at the height of the camera; its root is drawn uniformly. 1e-14 is weak, 1e-12 a hot day.

@@ -124,7 +124,7 @@ class PhysicalTurbulence(WarpEffect):
         wind_y_range: Range = (-1.0, 0.0),
         fps: float = 30.0,
         reach: float = 1000.0,
-        num_layers: int = 4,
+        num_layers: int = 3,
         depth: DepthSource | None = None,
         padding: str = "reflection",
         interpolation: str = "bilinear",

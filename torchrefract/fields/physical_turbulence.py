@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, cached, exact_matmul, shareable
 from torchrefract._validation import why_not_eager
-from torchrefract.fields.random_field import fast_size
+from torchrefract.fields.random_field import fast_size, periodic_part
 from torchrefract.random import white_noise
 
 GREEN = 550e-9  # m, wavelength of the light that counts most
@@ -397,22 +397,13 @@ def _gradient(
             for q, offset in zip((qx, qy), offsets, strict=True)
         ]
     spectrum = torch.complex(real, imaginary)
-    along_x = _part(torch.fft.ifft(spectrum, dim=2, norm="forward"), 2, rows) * qx
-    along_y = _part(torch.fft.ifft(spectrum * qy, dim=2, norm="forward"), 2, rows)
+    along_x = periodic_part(torch.fft.ifft(spectrum, dim=2, norm="forward"), 2, rows) * qx
+    along_y = periodic_part(torch.fft.ifft(spectrum * qy, dim=2, norm="forward"), 2, rows)
     gradient = []
     for lines, offset in zip((along_x, along_y), offsets, strict=True):
         lines.narrow(3, 0, 1).add_(offset)  # kx = 0 is what all pixels of a row share
-        gradient.append(_part(torch.fft.irfft(lines, n=size[1], dim=3, norm="forward"), 3, columns))
+        gradient.append(periodic_part(torch.fft.irfft(lines, n=size[1], dim=3, norm="forward"), 3, columns))
     return gradient
-
-
-def _part(values: Tensor, dim: int, span: range) -> Tensor:
-    """Return some positions of a periodic dimension."""
-    size = values.shape[dim]
-    if span.step == 1 and span.start >= 0 and span.stop <= size:  # far faster than by index
-        return values.narrow(dim, span.start, len(span))
-    index = torch.arange(span.start, span.stop, span.step, device=values.device)
-    return values.index_select(dim, index.remainder(size))
 
 
 def _sum(real: Tensor, imaginary: Tensor, size: tuple[int, int], rows: range, columns: range) -> Tensor:

@@ -149,7 +149,7 @@ def height_gain(end_height: Tensor, gains: Sequence[float]) -> Tensor:
     """
     table = as_device_tensor(gains, dtype=end_height.dtype, device=end_height.device)
     # The gain is smooth in 1 / (1 + e^(1/3)).
-    return _look_up(table, (_NUM_GAINS - 1) / (1 + _power(end_height, 1 / 3)))
+    return _interpolate(table, (_NUM_GAINS - 1) / (1 + _power(end_height, 1 / 3)))
 
 
 def layer_gradients(
@@ -226,21 +226,11 @@ def _spectrum(k: Tensor, air: Air) -> Tensor:
     return 0.033 * k.square() * (k.square() + k0 * k0) ** (-11 / 6) * torch.exp(-(k / km).square()) * seen
 
 
-def _integral(air: Air, highest: Tensor) -> Tensor:
-    """Return int kx^2 Phi A d^2k = pi int k (k^2 Phi A) dk up to wave numbers, 1/m, (n,), float64."""
-    lowest = 1e-5 * 2 * math.pi / air.outer_scale
-    steps = torch.linspace(0, 1, 4097, dtype=torch.float64, device=highest.device)
-    k = lowest * (highest[:, None] / lowest) ** steps
-    logs = (highest / lowest).log() / 4096
-    values = k.square() * _spectrum(k, air)
-    return math.pi * logs * (values.sum(dim=1) - (values[:, 0] + values[:, -1]) / 2)
-
-
 @lru_cache(maxsize=4096)
 def _strength(air: Air) -> float:
-    """Return int kx^2 Phi A d^2k, rad^2/m, for Cn2 = 1."""
-    highest = torch.tensor([5 * 5.92 / air.inner_scale], dtype=torch.float64, device="cpu")
-    return _integral(air, highest).item()
+    """Return int kx^2 Phi A d^2k = pi int k (k^2 Phi A) dk, rad^2/m, for Cn2 = 1."""
+    k = _wave_numbers(1.0, air)
+    return _variance_up_to(k, _spectrum(k, air))[-1].item()
 
 
 @lru_cache(maxsize=64)
@@ -267,7 +257,7 @@ def _densities(start: float, end: float, reach: float, air: Air) -> tuple[float,
     for s, w in zip((root**3).tolist(), (weight * root**2).tolist(), strict=True):
         width = 1 - s / reach
         density += w * (width / s) ** 2 * _spectrum(q / s, air._replace(aperture=air.aperture * width))
-    return (density / _variance_up_to(q, density)[-1]).tolist()
+    return tuple((density / _variance_up_to(q, density)[-1]).tolist())
 
 
 def _wave_numbers(end: float, air: Air, device: torch.device | None = None) -> Tensor:
@@ -284,7 +274,7 @@ def _variance_up_to(q: Tensor, density: Tensor) -> Tensor:
     return torch.cat([torch.zeros_like(q[:1]), steps.cumsum(dim=0)])
 
 
-def _look_up(table: Tensor, place: Tensor) -> Tensor:
+def _interpolate(table: Tensor, place: Tensor) -> Tensor:
     """Interpolate a table linearly at fractional indices of any shape."""
     low = place.detach().floor().clamp(0, len(table) - 2)
     index = low.long().flatten()
@@ -330,7 +320,7 @@ def _amplitudes(
 
     def at(table: Tensor, q: Tensor) -> Tensor:
         place = (q / table_q[0]).log() / (table_q[1] / table_q[0]).log()
-        return _look_up(table, place.clamp(0, _NUM_DENSITIES - 1))
+        return _interpolate(table, place.clamp(0, _NUM_DENSITIES - 1))
 
     power = torch.zeros(qy.shape[0], qx.shape[0], dtype=torch.float64, device=device)
     for dy in _SUBCELLS:  # the spectrum is steep at the lowest frequencies

@@ -51,7 +51,7 @@ class Air(NamedTuple):
     outer_scale: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Layers:
     """Layers of air, from the camera to the reach; layer k lies between edges k and k + 1.
 
@@ -292,7 +292,7 @@ def height_gains(exponent: float) -> tuple[float, ...]:
     # The integrand is smooth in the cubic root of the distance to the lower end of the ray.
     x = np.where(e < 1, y**3, 1 - y**3)
     values = (exponent * x ** (exponent - 1) * (e + (1 - e) * x) ** _HEIGHT_EXPONENT * 3 * y * y) @ weight
-    return np.where(z > 0, np.sqrt(values), 0.0).tolist()
+    return tuple(np.where(z > 0, np.sqrt(values), 0.0).tolist())
 
 
 def _frequencies(focal: tuple[float, float], size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:

@@ -86,8 +86,10 @@ def test_a_sample_depends_on_its_key_alone_and_a_single_one_has_no_deviation():
         assert value.abs().mean() > 1e-3
     with torch.autocast("cpu", torch.bfloat16):
         assert_close(model(image, torch.tensor([5, 6, 7])).flow, restored.flow, rtol=1e-3, atol=1e-4)
+    assert model.has_deviation
     model.samples = 1
-    assert not model(image).deviation.any()
+    assert not model.has_deviation
+    assert model(image).deviation is None
 
 
 def test_an_untrained_denoiser_knows_only_that_the_numbers_are_standard_normal():

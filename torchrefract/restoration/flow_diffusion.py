@@ -93,11 +93,16 @@ class FlowDiffusion(AveragedRestoration):
         self.register_buffer("center", torch.zeros(num_coefficients))
         self.register_buffer("components", torch.zeros(components, num_coefficients))
 
+    @property
+    def has_deviation(self) -> bool:
+        """Return True for at least two samples."""
+        return self.samples > 1
+
     @torch.no_grad()
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
         """Restore images (B, 3, H, W) in [0, 1] by the mean of the samples, with the deviation of the flow, px.
 
-        The deviation is 0 for one sample. The key is that of `RestorationModule.forward`.
+        One sample has no deviation. The key is that of `RestorationModule.forward`.
         """
         key = torch.zeros(len(degraded), dtype=torch.int64) if key is None else key
         numbers = self._sample(cast(Any, self.network).encode(degraded), self._stream(key, 0))
@@ -109,10 +114,12 @@ class FlowDiffusion(AveragedRestoration):
             maps = _sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
             center, maps = maps[0], maps[1:]
             flow = center + torch.einsum("bk,kchw->bchw", mean, maps)
-            covariance = rest.mT @ rest / max(1, self.samples - 1)
+            restored = Restored(warp(degraded, flow, padding="border")[0], flow)
+            if not self.has_deviation:
+                return restored
+            covariance = rest.mT @ rest / (self.samples - 1)
             variance = (torch.einsum("bkl,lchw->bkchw", covariance, maps) * maps).sum(dim=1)
-        deviation = variance.clamp(min=0).sqrt()
-        return Restored(warp(degraded, flow, padding="border")[0], flow, deviation=deviation)
+        return restored._replace(deviation=variance.clamp(min=0).sqrt())
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
         """Compute the loss at random levels for each sample; each step has its own draws."""

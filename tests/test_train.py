@@ -101,6 +101,14 @@ def test_a_network_of_lenses_says_so_for_other_warps(call):
     assert "severity 3; lens_net predicts the flow of a lens alone: add model=resunet for other warps" in haze
 
 
+def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call):
+    data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
+    dust = call("train", "+task=deweather", "scene=unpaved_road", *data, "trainer.max_epochs=1").out
+    assert "severity 3; it moves pixels too, which deweather does not undo: that takes +task=undistort" in dust
+    fog = call("train", "+task=deweather", "scene=cape_town_fog", *data, "trainer.max_epochs=1").out
+    assert "severity 3\n" in fog
+
+
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
     for name in ("train/loss", "train/psnr", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         assert sorted(metrics(trained.folder, name)) == [0, 1]

@@ -57,6 +57,15 @@ def test_frames_of_a_video_are_evenly_spaced_and_a_blank_one_is_warned_of(call, 
     assert vague.startswith("warning: the lens cannot be distinguished from no distortion (95 %)")
 
 
+def test_a_damaged_video_is_named_and_the_others_are_used(call, folder):
+    (folder / "raw" / "bad.mp4").write_bytes(b"no video")
+    outcome = call("estimate_lens", "input=raw")
+    assert "from 6 frames" in outcome.out
+    assert outcome.err.splitlines()[0].startswith("skipped: raw/bad.mp4 is not a video with a frame that")
+    last = call("estimate_lens", "input=raw/bad.mp4").err.splitlines()[-1]
+    assert last.startswith("error: input must hold a readable picture or video, got raw/bad.mp4 is not a video with")
+
+
 def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
     alone = call("estimate_lens", "input=raw", "out=a.yaml").out.removeprefix("a.yaml")
     both = call("estimate_lens", "input=raw", "out=b.yaml", f"checkpoint={shifted}").out.removeprefix("b.yaml")

@@ -85,7 +85,8 @@ def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device
 
 def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
-    counts = [media.video_info(file)[0] if media.is_video(file) else 1 for file in files]
+    # A video that states no frames is read too, which says why it has none.
+    counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
     total, chosen = sum(counts), list[tuple[Path, list[int]]]()
     numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
@@ -97,6 +98,7 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
     """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
     num_read, reason = 0, ""
     for file, times in chosen:
+        num_before = num_read
         try:
             if media.is_video(file):
                 frames = (frame for _, frame in media.read_video(file, times, upright=upright))
@@ -105,11 +107,13 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             for frame in frames:
                 yield frame
                 num_read += 1
+            if times and num_read == num_before:
+                raise UnreadableImageError(f"{file} is not a video with a frame that can be decoded")
         except UnreadableImageError as error:
             reason = str(error)
             print(f"skipped: {reason}", file=sys.stderr)
     if num_read == 0:
-        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
+        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason}")
 
 
 def _load_network(cfg: DictConfig) -> Predictor:

@@ -9,7 +9,7 @@ from diffusers import DDPMScheduler
 from torch import Tensor, nn
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_count
+from torchrefract._validation import UsageError, check_count
 from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
 from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
@@ -122,7 +122,11 @@ class FlowDiffusion(AveragedRestoration):
         return restored._replace(deviation=variance.clamp(min=0).sqrt())
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at random levels for each sample; each step has its own draws."""
+        """Compute the loss at random levels for each sample; each step has its own draws.
+
+        Raises:
+            UsageError: the first batch has no more lenses than there are components.
+        """
         if not self.components.any():
             self._find_components(batch)
         return self._loss(batch, 1 + self.global_step), None
@@ -165,6 +169,12 @@ class FlowDiffusion(AveragedRestoration):
 
     def _find_components(self, batch: Pair) -> None:
         """Find the mean and the principal components of the coefficients of a batch, over all ranks."""
+        num_lenses, num_components = len(batch.flow) * self.trainer.world_size, len(self.components)
+        if num_lenses <= num_components:
+            raise UsageError(
+                f"data.batch_size must be above model.components={num_components}, which are those of the lenses of "
+                f"the first batch, got {num_lenses}: raise it, or lower model.components"
+            )
         coefficients = fit_polynomial(batch).double()  # autocast leaves doubles as they are
         reduce = self.trainer.strategy.reduce
         mean = reduce(coefficients.mean(dim=0), reduce_op="mean")

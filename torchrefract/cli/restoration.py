@@ -57,6 +57,7 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
+    check_run_folder,
     how_to_continue,
     load_model,
     load_weights,
@@ -78,6 +79,8 @@ _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the 
 def train(cfg: DictConfig) -> None:
     """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
     data, model, trainer, checkpoint = _make_parts(cfg)
+    if checkpoint is None:
+        check_run_folder(as_path(cfg.run_dir))
     num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
@@ -293,7 +296,6 @@ class _Job(NamedTuple):
         return self.out / output_name(file).relative_to(self.source)
 
     def map_target(self, file: Path) -> Path:
-        """Return the path of the map of the deviation of a picture."""
         return self.target(file).with_suffix(".deviation.png")
 
     def is_done(self, file: Path) -> bool:
@@ -307,14 +309,14 @@ class _Job(NamedTuple):
         return self._replace(restore_images=LensRestorer(lens, interpolation=self.restorer.interpolation).restore)
 
     def restore(self, images: Sequence[Tensor]) -> Iterator[tuple[Tensor, Tensor | None]]:
-        """Restore images (3, H, W) in [0, 1], to the right of which `side_by_side` puts the restoration.
+        """Restore images (3, H, W) in [0, 1]; also yield the deviation of the flow, (H, W), px, or None.
 
-        Also yield the deviation of the flow, (H, W), px, if the model has one.
+        `side_by_side` puts the image to the left of its restoration.
         """
         moved = [image.to(self.device).contiguous() for image in images]
         for before, restored in zip(moved, self.restore_images(moved), strict=True):
-            after = restored.image[0]
-            deviation = None if restored.deviation is None else restored.deviation[0].norm(dim=0)
+            after, deviations = restored.image[0], restored.deviation
+            deviation = None if deviations is None else deviations[0].norm(dim=0)
             yield torch.cat([before, after], dim=2) if self.side_by_side else after, deviation
 
 
@@ -357,9 +359,7 @@ def _check_maps(files: Sequence[Path], job: _Job) -> None:
     owners = {job.target(file): file for file in files}
     for file in files:
         if is_video(file):
-            raise UsageError(
-                f"deviation must be false for videos, got true with {file}; restore its frames as pictures"
-            )
+            raise UsageError(f"deviation must be false for videos, got true with {file}: save its frames as files")
         path = job.map_target(file)
         if path in owners:
             raise UsageError(

@@ -119,6 +119,15 @@ def how_to_continue(path: Path) -> str:
     return f"ckpt_path={path} continues" if path.is_file() else "no epoch was completed, so nothing is saved"
 
 
+def check_run_folder(run: Path) -> None:
+    """Raise CheckpointError if a new training would replace the checkpoints of another one in its run folder."""
+    if (last := run / "last.ckpt").is_file():
+        raise CheckpointError(
+            f"run_dir must be a folder without the checkpoints of another training, got {run}: {how_to_continue(last)} "
+            "that one, and another run_dir keeps it"
+        )
+
+
 def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
     """Return the number of complete epochs of a training checkpoint.
 

@@ -83,8 +83,7 @@ def test_no_pixel_of_2000_drawn_lenses_is_without_a_source(severity):
     assert d.params.zoom.max() <= 1
 
 
-@pytest.mark.parametrize("tolerance_px", [0.02, None])
-@pytest.mark.parametrize("size", [(90, 160), (160, 90), (64, 64)])
+@pytest.mark.parametrize(("size", "tolerance_px"), [((90, 160), 0.02), ((160, 90), None), ((64, 64), 0.02)])
 def test_decentered_lenses_fill_their_frames(size, tolerance_px):
     effect = LensDistortion(**DECENTERED, tolerance_px=tolerance_px)
     d = effect.degrade(torch.zeros(100, 1, *size), seed=1)
@@ -123,7 +122,7 @@ def test_both_flows_agree_with_an_independent_lens_in_float64(dtype):
 
 
 def test_planned_flows_of_filled_frames_are_within_the_tolerance():
-    for severity in presets.SEVERITIES:
+    for severity in (1, 5):
         effect = presets.cheap_dashcam(severity)
         image = torch.zeros(3, 1, 270, 480)
         planned, exact = effect.degrade(image, seed=4), effect.exact().degrade(image.double(), seed=4)
@@ -161,9 +160,9 @@ def test_a_lens_without_distortion_stays_the_identity():
 
 def test_lenses_that_were_drawn_for_one_size_fill_frames_of_other_sizes():
     effect = LensDistortion(**DECENTERED)
-    params = effect.sample(torch.zeros(50, 1, 90, 160), seed=6)
+    params = effect.sample(torch.zeros(20, 1, 90, 160), seed=6)
     for size in ((45, 80), (91, 161), (180, 320)):
-        assert effect.apply(torch.zeros(50, 1, *size), params).valid.all()
+        assert effect.apply(torch.zeros(20, 1, *size), params).valid.all()
 
 
 def test_another_zoom_than_that_of_the_plan_is_computed_exactly():

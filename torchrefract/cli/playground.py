@@ -131,7 +131,7 @@ def make_page(table: Sliders, *, max_side: int) -> gr.Blocks:
                     with gr.Tab("YAML"):
                         yaml = gr.Code(language="yaml", label="YAML of the effect, as in conf/scene")
             with gr.Column(scale=1, min_width=320, elem_classes="controls"):
-                path = gr.File(label="a JPEG, PNG, WebP or BMP of at most 50 MB, or a rendered road", height=120)
+                path = gr.File(label="a JPEG, PNG, WebP or BMP of at most 50 MB, or a rendered road", height=160)
                 road = gr.Number(0, label="number of the rendered road", precision=0, minimum=0)
                 choice = gr.Dropdown(choices(), value="cape_town_fog", label="scene or effect", elem_id="choice")
                 severity = gr.Slider(1, 5, 3, step=1, label="severity of the scene", elem_id="severity")

@@ -160,7 +160,7 @@ def test_a_sample_depends_on_its_key_alone(make):
 
 def test_one_graph_draws_the_same_lenses():
     image = torch.rand(3, 3, 36, 64)
-    effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05, frame="pad")
+    effect = LensDistortion.from_lenses(OTHERS, tolerance_px=0.05)
     torch.manual_seed(1)
     expected = effect(image)
     torch.manual_seed(1)

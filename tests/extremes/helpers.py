@@ -35,7 +35,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "night glow": tr.NightGlow,
     "turbulence blur": partial(tr.TurbulenceBlur, cn2_range=(1e-11, 2e-11), focal=50.0),
     "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
-    "compose": lambda: tr.Compose([tr.Turbulence(covariance="gaussian"), tr.LensDistortion(), tr.UniformFog()]),
+    "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),
     "rectification": partial(tr.Rectification, _CAMERA),
 }

@@ -92,7 +92,7 @@ def covariance(air: Air, *, focal: float, distance: float, side: int, num_layers
 def test_two_rays_are_correlated_as_in_kolmogorovs_air():
     distance, aperture = 1000.0, 0.1
     focal = 4 * distance / aperture  # four pixels for each aperture
-    along, across = covariance(Air(aperture, 1e-3, 1e6), focal=focal, distance=distance, side=1024)
+    along, across = covariance(Air(aperture, 1e-3, 1e6), focal=focal, distance=distance, side=2048)
     assert along[0].item() == pytest.approx(1, abs=0.02)
     assert across[0].item() == pytest.approx(1, abs=0.02)
     for separation, expected in CORRELATION.items():

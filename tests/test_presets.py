@@ -11,7 +11,25 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-import torchrefract as tr
+from torchrefract import (
+    Compose,
+    DivergenceFree,
+    GroundPlaneDepth,
+    HeterogeneousFog,
+    LensDistortion,
+    LensFlare,
+    NightGlow,
+    OneOf,
+    PhysicalTurbulence,
+    RoadMirage,
+    RollingShutter,
+    SunGlare,
+    ThinPlateSpline,
+    Turbulence,
+    TurbulenceBlur,
+    UniformFog,
+    presets,
+)
 from torchrefract.cameras.brown_conrady import distort_with_jacobian
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.base import Effect
@@ -20,19 +38,19 @@ from torchrefract.fields.srgb import srgb_to_linear
 SIZE = (54, 96)
 SCENES: dict[str, Callable[..., Any]] = {
     name: function
-    for name, function in inspect.getmembers(tr.presets, inspect.isfunction)
-    if not name.startswith("_") and function.__module__ == tr.presets.__name__
+    for name, function in inspect.getmembers(presets, inspect.isfunction)
+    if not name.startswith("_") and function.__module__ == presets.__name__
 }
 EFFECTS = {
-    "cheap_dashcam": {tr.LensDistortion},
-    "cape_town_fog": {tr.HeterogeneousFog},
-    "night_fog": {tr.HeterogeneousFog, tr.NightGlow},
-    "limpopo_sun_glare": {tr.SunGlare},
-    "highveld_heat_haze": {tr.RoadMirage, tr.Turbulence},
-    "highveld_telephoto": {tr.PhysicalTurbulence, tr.TurbulenceBlur},
-    "unpaved_road": {tr.HeterogeneousFog, tr.Turbulence, tr.RollingShutter},
-    "paper_refractive": {tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree},
-    "paper_weather": {tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare},
+    "cheap_dashcam": {LensDistortion},
+    "cape_town_fog": {HeterogeneousFog},
+    "night_fog": {HeterogeneousFog, NightGlow},
+    "limpopo_sun_glare": {SunGlare},
+    "highveld_heat_haze": {RoadMirage, Turbulence},
+    "highveld_telephoto": {PhysicalTurbulence, TurbulenceBlur},
+    "unpaved_road": {HeterogeneousFog, Turbulence, RollingShutter},
+    "paper_refractive": {LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree},
+    "paper_weather": {UniformFog, HeterogeneousFog, LensFlare},
 }
 
 # Arguments of each effect of a scene that is not the paper's.
@@ -51,7 +69,7 @@ _PINHOLE = {"width": 640, "height": 360, "fx": 500.0, "fy": 510.0, "cx": 326.5, 
 PLACE: dict[str, Any] = {
     "camera": Camera(**_PINHOLE, coefficients=(0.0,) * 4, model="opencv"),
     "horizon": 0.4,
-    "depth": tr.GroundPlaneDepth(),
+    "depth": GroundPlaneDepth(),
     "width": 640,
 }
 
@@ -68,7 +86,7 @@ def scene_for_size(name: str, severity: int = 3) -> Effect:
 
 
 def leaves(effect: Effect) -> Iterator[Any]:
-    if isinstance(effect, tr.Compose):
+    if isinstance(effect, Compose):
         for child in effect.effects:
             yield from leaves(child)  # pyright: ignore[reportArgumentType]  # effects hold effects
     else:
@@ -91,7 +109,7 @@ def test_a_scene_has_its_effects_and_no_others(scene):
 
 
 def test_each_severity_is_stronger_than_the_one_before(scene):
-    strengths = [strength(scene_for_size(scene, severity)) for severity in tr.presets.SEVERITIES]
+    strengths = [strength(scene_for_size(scene, severity)) for severity in presets.SEVERITIES]
     assert all(later > 1.03 * earlier for earlier, later in pairwise(strengths))
 
 
@@ -111,7 +129,7 @@ def test_no_scene_folds_the_frame_at_its_largest_severity(scene):
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("severity", tr.presets.SEVERITIES)
+@pytest.mark.parametrize("severity", presets.SEVERITIES)
 def test_no_lens_of_the_dashcam_is_so_near_a_fold_that_pixels_have_no_source(severity):
     effect = SCENES["cheap_dashcam"](severity)
     ends = product(effect.k1_range, effect.k2_range, effect.p1_range, effect.p2_range)
@@ -136,7 +154,7 @@ def test_severities_have_the_documented_values():
         values = getattr(params.children[0] if hasattr(params, "children") else params, field)
         assert low <= values.min() < values.max() <= high
         assert values.mean().item() == pytest.approx((low + high) / 2, rel=0.03)
-    for severity in tr.presets.SEVERITIES:
+    for severity in presets.SEVERITIES:
         uniform, heterogeneous, flare = SCENES["paper_weather"](severity).effects
         assert uniform.visibility_range == heterogeneous.visibility_range == (300 / severity,) * 2
         assert sum(flare.strength_range) / 2 == pytest.approx(0.2 * severity)
@@ -148,13 +166,13 @@ def test_a_camera_that_meters_fog_by_day_darkens_it_and_leaves_the_night():
     white[:, :, 40:] = 0.3
     night[:, :, 20:24, 40:44] = 0.6
     for frame, is_darker in ((white, True), (night, False)):
-        scene: Any = tr.presets.cape_town_fog(5, depth=tr.GroundPlaneDepth(), exposure=True)
+        scene: Any = presets.cape_town_fog(5, depth=GroundPlaneDepth(), exposure=True)
         params = scene.sample(frame, seed=1)
         foggy = scene.effects[0].apply(frame, params.children[0]).image
         exposed = scene.apply(frame, params).image
         assert torch.allclose(exposed, foggy, atol=1e-3) is not is_darker
         assert exposed.mean() < 0.9 * foggy.mean() or not is_darker
-    assert 0.15 < srgb_to_linear(tr.presets.cape_town_fog(5, exposure=True).degrade(white, seed=1).image).mean() < 0.3
+    assert 0.15 < srgb_to_linear(presets.cape_town_fog(5, exposure=True).degrade(white, seed=1).image).mean() < 0.3
 
 
 @pytest.mark.quick
@@ -163,8 +181,8 @@ def test_lamps_shine_through_fog_at_night_in_a_glow():
     frame[:, :, 30:33, 80:83] = 1.0
     frame[:, :, 30:33, 20:23] = 0.6  # a lit wall
     depth = torch.full((1, 1, 90, 160), 30.0)
-    plain = tr.presets.cape_town_fog(4).degrade(frame, seed=1, depth=depth).image
-    foggy = tr.presets.night_fog(4, glow={"optical_depth_range": (2.0, 2.0)}).degrade(frame, seed=1, depth=depth).image
+    plain = presets.cape_town_fog(4).degrade(frame, seed=1, depth=depth).image
+    foggy = presets.night_fog(4, glow={"optical_depth_range": (2.0, 2.0)}).degrade(frame, seed=1, depth=depth).image
     assert (plain[..., 31, 81] < 0.5).all()
     assert (foggy[..., 31, 81] > 0.95).all()
     assert (foggy[..., 31, 21] < 0.5).all()
@@ -172,14 +190,14 @@ def test_lamps_shine_through_fog_at_night_in_a_glow():
     day = torch.full((1, 3, 90, 160), 0.7)
     day[:, :, 60:] = 0.3
     day[:, :, 70:73, 80:83] = 1.0
-    bright = tr.presets.night_fog(4).degrade(day, seed=1, depth=depth)
+    bright = presets.night_fog(4).degrade(day, seed=1, depth=depth)
     assert bright.intensity.max() == 0
     assert (bright.image[..., 71, 81] < 0.95).all()
 
 
 def test_severities_of_heat_haze_have_the_documented_cn2():
-    for severity, cn2 in zip(tr.presets.SEVERITIES, (8e-11, 3e-10, 7e-10, 1.5e-9, 2.8e-9), strict=True):
-        (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, tr.Turbulence))
+    for severity, cn2 in zip(presets.SEVERITIES, (8e-11, 3e-10, 7e-10, 1.5e-9, 2.8e-9), strict=True):
+        (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, Turbulence))
         low, high = (math.sqrt(value) for value in haze.equivalent_cn2(width=1920, distance=200.0))
         assert ((low + high) / 2) ** 2 == pytest.approx(cn2, rel=0.06)
 
@@ -202,7 +220,7 @@ def test_displacements_scale_with_the_width(name):
     wide, narrow = (SCENES[name](3, width=width) for width in (1920, 480))
     for first, second in zip(leaves(wide), leaves(narrow), strict=True):
         for option in ("amplitude_range", "length_range", "aperture_range"):
-            if hasattr(first, option) and not isinstance(first, tr.HeterogeneousFog):
+            if hasattr(first, option) and not isinstance(first, HeterogeneousFog):
                 assert getattr(first, option) == pytest.approx([4 * value for value in getattr(second, option)])
     with pytest.raises(ValueError, match="width must be above 0, got 0"):
         SCENES[name](3, width=0)
@@ -211,7 +229,7 @@ def test_displacements_scale_with_the_width(name):
 @pytest.mark.parametrize("name", ["paper_refractive", "paper_weather"])
 def test_one_of_the_paper_s_effects_is_applied_to_each_sample(name):
     effect = scene_for_size(name)
-    assert isinstance(effect, tr.OneOf)
+    assert isinstance(effect, OneOf)
     params = effect.sample(torch.zeros(200, 3, *SIZE), seed=1)
     applied = torch.stack([child.applied for child in params.children])
     assert (applied.sum(dim=0) == 1).all()
@@ -230,7 +248,7 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
         assert leaf.p == 0.25
         view = getattr(leaf, "medium", leaf)
         assert getattr(view, "camera", camera) == camera
-        assert view.depth is (None if isinstance(leaf, tr.LensDistortion | tr.SunGlare | tr.NightGlow) else depth)
+        assert view.depth is (None if isinstance(leaf, LensDistortion | SunGlare | NightGlow) else depth)
         assert getattr(leaf, "horizon", 0.4) == 0.4
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):
@@ -249,7 +267,7 @@ def test_arguments_of_one_effect_may_come_from_a_configuration():
 
 @pytest.mark.quick
 def test_each_scene_takes_camera_horizon_depth_and_width_and_the_page_says_which_it_uses(scene):
-    lines = [line.split(maxsplit=1) for line in str(tr.presets.__doc__).splitlines() if line.startswith("    ")]
+    lines = [line.split(maxsplit=1) for line in str(presets.__doc__).splitlines() if line.startswith("    ")]
     used = {name for name in PLACE if name in dict(line for line in lines if len(line) == 2)[scene]}
     assert used == {
         name for name, value in PLACE.items() if repr(SCENES[scene](**{name: value})) != repr(SCENES[scene]())

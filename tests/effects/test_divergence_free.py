@@ -2,12 +2,31 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import DivergenceFree, folding, jacobian_determinant, warp
 from torchrefract.fields.random_field import COVARIANCES
 
 GENTLE: dict[str, Any] = {"amplitude_range": (3.0, 3.0), "length_range": (12.0, 20.0)}
+
+
+def divergence(flow: Tensor) -> Tensor:
+    """Return the divergence by central differences, inside the frame."""
+    u_x = (flow[:, 0, 1:-1, 2:] - flow[:, 0, 1:-1, :-2]) / 2
+    v_y = (flow[:, 1, 2:, 1:-1] - flow[:, 1, :-2, 1:-1]) / 2
+    return u_x + v_y
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-4), (torch.float64, 1e-12)])
+def test_the_flow_has_no_divergence(dtype, bound):
+    effect = DivergenceFree(**GENTLE, tolerance_px=None)
+    flow = effect.degrade(torch.zeros(2, 1, 61, 83, dtype=dtype), seed=1).flow
+    slope = (flow[:, 0, :, 2:] - flow[:, 0, :, :-2]).square().mean().sqrt() / 2
+    assert divergence(flow).abs().max() < bound * slope
+    # The curl is as large as the gradients.
+    curl = (flow[:, 1, 1:-1, 2:] - flow[:, 1, 1:-1, :-2] - flow[:, 0, 2:, 1:-1] + flow[:, 0, :-2, 1:-1]) / 2
+    assert curl.square().mean().sqrt() > slope
 
 
 @pytest.mark.parametrize("covariance", COVARIANCES)

@@ -297,3 +297,15 @@ def test_float32_is_as_exact_at_late_frames_as_at_first():
             mean_extinction(keys(1), distance.to(t), **parameters) for t in (torch.float64, torch.float32)
         )
         assert_close(single.double(), double, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("columns", [1, 4])
+def test_gradients_match_finite_differences(columns):
+    size, parameters = {"height": 3, "width": 4, "focal": (4.0, 4.0), "center": (1.5, 1.0)}, moving_fogs(1)
+
+    def m(distance: Tensor, *values: Tensor) -> Tensor:
+        return mean_extinction(keys(1), distance, **size, **dict(zip(parameters, values, strict=True)))
+
+    # Between the slices, at which the mean has a kink.
+    inputs = [value.requires_grad_() for value in (1 + distances(1, 3, columns), *parameters.values())]
+    assert torch.autograd.gradcheck(m, inputs, fast_mode=True)

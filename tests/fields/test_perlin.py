@@ -160,3 +160,14 @@ def test_float32_is_exact_to_1e_5(frame):
     single, double = (noise_of(keys(6), PERIODS, 211, 397, **motion, dtype=d) for d in (torch.float32, torch.float64))
     assert single.dtype == torch.float32
     assert_close(single.double(), double, rtol=0, atol=1e-5)
+
+
+def test_gradients_of_the_motion_match_finite_differences():
+    key = keys(1, 2)
+
+    def noise(frame: Tensor, wind: Tensor, decorrelation: Tensor) -> Tensor:
+        octaves = octaves_of(key, (3.0, 9.0), 4, 40, frame, wind, decorrelation)
+        return perlin_noise(octaves, weights_of(2, (3.0, 9.0)))
+
+    inputs = [torch.tensor([0.0, 7.0]), torch.tensor([[0.3, -0.2], [0.0, 0.1]]), torch.tensor([20.0, 35.0])]
+    assert torch.autograd.gradcheck(noise, [value.double().requires_grad_() for value in inputs], fast_mode=True)

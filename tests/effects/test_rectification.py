@@ -46,6 +46,23 @@ ALL = {
 every_model = pytest.mark.parametrize("camera", ALL.values(), ids=ALL)
 
 
+def test_the_flow_of_frames_of_half_the_size_is_opencvs_map(oracle):
+    height, width = DASHCAM.height // 2, DASHCAM.width // 2
+    effect = Rectification(DASHCAM, tolerance_px=None)
+    flow = effect.degrade(torch.zeros(1, 1, height, width, dtype=torch.float64), seed=0).flow[0]
+    # Pixel centers are whole numbers, so the principal point keeps its half pixel.
+    cx, cy = ((c + 0.5) / 2 - 0.5 for c in (DASHCAM.cx, DASHCAM.cy))
+    matrix, vector = (
+        np.array([[DASHCAM.fx / 2, 0, cx], [0, DASHCAM.fy / 2, cy], [0, 0, 1]]),
+        np.array(DASHCAM.coefficients),
+    )
+    theirs = cv2.initUndistortRectifyMap(matrix, vector, np.empty(0), matrix, (width, height), cv2.CV_32FC1)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    expected = torch.from_numpy(np.stack(theirs))
+    oracle("rectification, cv2.initUndistortRectifyMap", flow + torch.stack([x, y]), expected, 1e-3)
+    assert flow.abs().max() > 10
+
+
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Project points (2, N) of the plane z = 1 by OpenCV or in closed form -> (2, N), px."""
     matrix, vector, space = (

@@ -186,6 +186,8 @@ def test_invalid_flow_values_are_masked(value, dtype, device, full_extremes):
         inverse, solved, residual = tr.invert_flow(flow.detach())
         assert inverse.isfinite().all()
         assert residual.isfinite().all()
+        assert solved[0].all()
+        assert not inverse[0].any()
         assert not solved[1, 0, size[0] // 2, size[1] // 2]
 
 

@@ -210,7 +210,7 @@ def test_a_description_has_the_squares_and_corners_of_the_board(squares, legacy)
     assert text.endswith(f"with {count} corners as on a board of squares={squares}")
 
 
-@pytest.mark.parametrize("squares", ["4x4", "7x6"])
+@pytest.mark.parametrize("squares", ["4x4", "4x6", "7x6"])
 def test_columns_and_rows_of_a_chessboard_are_those_of_the_picture(squares):
     board = Chessboard(squares=squares)
     columns, rows = board.num_corners

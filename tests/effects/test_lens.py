@@ -145,6 +145,16 @@ def test_strong_pincushions_converge_everywhere(k1):
     assert degraded.valid.all()
 
 
+@pytest.mark.parametrize(("padding", "outside"), [("zeros", 0.0), ("border", 1.0), ("reflection", 1.0)])
+def test_padding_fills_pixels_that_show_points_outside_the_frame(padding, outside):
+    # The corners of a barrel distortion show points outside the clean frame.
+    effect = LensDistortion(padding=padding)
+    degraded = effect.apply(torch.ones(1, 1, 36, 64), lenses({"k1": -0.2, "k2": 0.05}))
+    assert not degraded.valid[0, 0, 0, 0]
+    assert degraded.image[0, 0, 0, 0] == outside
+    assert degraded.image[0, 0, 18, 32] == 1
+
+
 def test_restore_valid_holds_where_the_degraded_frame_shows_the_pixel():
     # A pincushion distortion moves the corners of the scene out of the frame.
     degraded = LensDistortion().apply(torch.ones(1, 1, 36, 64), lenses({"k1": 0.3}))

@@ -307,14 +307,13 @@ def test_gradients_reach_every_effect_and_the_image():
 
 
 def test_one_graph_draws_and_degrades_as_eager_mode():
-    lens = LensDistortion(frame="pad", p=0.7)  # with less to compile than a view that fills the frame
-    choice = OneOf([lens, ThinPlateSpline()])
+    choice = OneOf([LensFlare(p=0.7), ThinPlateSpline()])
     effect = Compose([ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), choice])
     image = picture(4, 3, 24, 32)
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
     assert not torch.equal(*expected)
-    compiled = torch.compile(effect, fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(effect, fullgraph=True, backend="eager")
     torch.manual_seed(3)
     assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
 

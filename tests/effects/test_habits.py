@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
+from torchrefract.planning.plan import TOLERANCE_PX
 
 
 @pytest.fixture(params=EFFECTS)
@@ -126,6 +127,19 @@ def test_vmap_over_samples_or_params_equals_the_batch(effect):
     for in_dims, image in ((0, images), (None, images[0])):
         expected = effect.apply(image.expand_as(images), params).image
         assert_close(torch.vmap(degrade, in_dims=(in_dims, 0))(image, params), expected, rtol=0, atol=2e-4)
+
+
+def test_vmap_computes_each_pixel_of_a_composition_that_is_else_measured():
+    effect = tr.Compose([tr.Turbulence(covariance="gaussian"), tr.LensDistortion()])
+    images = random_frames(3, 3)
+    params = effect.sample(images, seed=7)
+    expected = effect.apply(images, params)
+
+    def flow(image: Tensor, params: Any) -> Tensor:
+        return effect.apply(image[None], pytree.tree_map(lambda value: value[None], params)).flow[0]
+
+    difference = (torch.vmap(flow)(images, params) - expected.flow).norm(dim=1)
+    assert 1e-4 < difference.max() < TOLERANCE_PX
 
 
 def test_autocast_changes_nothing(effect):

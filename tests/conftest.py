@@ -2,6 +2,7 @@ import gc
 import importlib
 import logging
 import math
+import multiprocessing
 import os
 import socket
 import subprocess
@@ -278,7 +279,7 @@ class Trained(NamedTuple):
 @pytest.fixture(scope="session")
 def small() -> tuple[str, ...]:
     """Return arguments of a training that takes seconds."""
-    data = ("data.train_count=16", "data.val_count=8", "data.batch_size=4", "data.size=[32,64]", "data.workers=0")
+    data = ("data.train_count=8", "data.val_count=4", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
     return (*data, "trainer.max_epochs=2", "model=resunet", "model.network.encoder=tu-test_resnet")
 
 
@@ -294,6 +295,28 @@ def spawn() -> Callable[..., Outcome]:
         return Outcome(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def fork() -> Callable[..., Any]:
+    """Return a function that starts a command in a process forked from this one, which has imported everything.
+
+    The process leads a group of its own, and uses one thread.
+    """
+
+    def start(name: str, *words: str, cwd: Path) -> Any:
+        def run() -> None:
+            os.setsid()
+            os.chdir(cwd)
+            torch.set_num_threads(1)
+            sys.argv = [f"torchrefract.{name}", *words]
+            importlib.import_module(f"torchrefract.{name}").main()
+
+        process = multiprocessing.get_context("fork").Process(target=run)
+        process.start()
+        return process
+
+    return start
 
 
 @pytest.fixture(scope="session")

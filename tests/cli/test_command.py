@@ -310,7 +310,7 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
         ("model.network.encoder=tu-nonsense", "model: encoder must be a name of .*, got tu-nonsense"),
         ("data.size=[64", r"\[64"),
         ("data.size=[4,4]", "data: size must be at least 8, got 4"),
-        ("data.batch_size=17", "data: batch_size must be at most the 16 training frames, got 17"),
+        ("data.batch_size=9", "data: batch_size must be at most the 8 training frames, got 9"),
         ("data.workers=-1", "data: workers must be at least 0, got -1"),
         ("trainer.max_epochs=-5", "trainer: .*max_epochs.*-5"),
         ("seed=-1", "seed.*-1"),

@@ -236,14 +236,14 @@ def test_each_line_of_the_table_names_its_metric_seed_and_versions(call, tmp_pat
     for path in frames.iterdir():
         (tmp_path / "labels" / f"{path.stem}.txt").write_text(f"1 {19 / 64} {19 / 36} {22 / 64} {22 / 36}\n")
     run = ("robustness.__main__", f"model=gray:{model}", "data=frames", "out=out", "seed=3", "limit=2", *words)
-    run += ("scene=[cape_town_fog,cheap_dashcam]", "severity=[1,3]")
+    run += ("scene=cheap_dashcam", "severity=[1,3]")
     for _ in range(2):  # the second run takes all scores of the first
         assert call(*run).code == 0
         with (tmp_path / "out" / "results.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         earlier = ["scene", "severity", "quantity", "value", "unit", "num_images", "score", "drop", "low", "high"]
         assert list(rows[0])[: len(earlier)] == earlier
-        assert len(rows) == 4
+        assert len(rows) == 2
         for row in rows:
             assert (row["metric"], row["seed"]) == (metric, "3")
             assert (row["torchrefract"], row["torch"]) == (torchrefract.__version__, torch.__version__)
@@ -329,16 +329,15 @@ def test_batches_of_a_picture_give_the_scores_of_single_ones(call, tmp_path, fra
         "import torch, gray\nsizes = []\n\ndef pixels(images):\n    sizes.append(len(images))\n"
         "    return gray.pixels(images)\n\ndef one(images):\n    return gray.pixels(images)[:1]\n"
     )
-    words = ("robustness.__main__", "data=frames", "scene=[unpaved_road,cheap_dashcam]", "severity=[1,3,5]")
-    words += ("model=batches:pixels", "device=cpu", "limit=3")
+    words = ("robustness.__main__", "data=frames", "scene=[cape_town_fog,cheap_dashcam]", "severity=[1,5]")
+    words += ("model=batches:pixels", "device=cpu", "limit=2")
     for i, search in enumerate(((), ("worst_case=true", "worst_case_draws=2"))):
         single, batch = f"out=single{i}", f"out=batch{i}"
         assert call(*words, single, *search).code == 0
         sys.modules["batches"].sizes.clear()
-        assert call(*words, batch, "batch_size=4", *search).code == 0
-        number = 6 if not search else 12  # of degraded versions
-        sizes = [1, *[4] * (number // 4), *[number % 4] * (number % 4 > 0)] * 3
-        assert sys.modules["batches"].sizes[: len(sizes)] == sizes
+        assert call(*words, batch, "batch_size=3", *search).code == 0
+        sizes = [1, 3, 3, 2] if search else [1, 3, 1]  # of the clean picture, and of degraded versions
+        assert sys.modules["batches"].sizes[: 2 * len(sizes)] == 2 * sizes
         files = [tmp_path / out.removeprefix("out=") / "scores.jsonl" for out in (single, batch)]
         assert files[0].read_bytes() == files[1].read_bytes()
     *_, message = call(*words[:4], "model=batches:one", "out=one", "batch_size=4").err.splitlines()

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -306,6 +307,8 @@ def fork() -> Callable[..., Any]:
 
     def start(name: str, *words: str, cwd: Path) -> Any:
         def run() -> None:
+            server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]  # not in stubs
+            server._forkserver_pid = server._forkserver_alive_fd = None  # that of this process is no child of the new one
             os.setsid()
             os.chdir(cwd)
             torch.set_num_threads(1)

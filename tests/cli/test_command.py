@@ -263,7 +263,8 @@ def test_a_command_without_a_task_lists_the_tasks(call):
 
 
 def test_an_evaluation_without_a_checkpoint_names_the_option(call):
-    assert call("eval").message.startswith("ckpt_path must be the path of a checkpoint: add ckpt_path=")
+    message = "ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none"
+    assert call("eval").message == message
     assert call("eval", "ckpt_path=a=1.ckpt").message.endswith(
         "must be a checkpoint file, such as <run>/last.ckpt, got a=1.ckpt"
     )

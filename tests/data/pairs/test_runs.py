@@ -66,6 +66,7 @@ def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers
     processes = descendants(run.pid)
     run.kill()
     run.join()
+    assert run.exitcode == -signal.SIGKILL
     # A worker that outlived the run could write at the same time as the next run.
     wait_for(lambda: not any(is_running(process) for process in processes))
     assert "exist already" in call("generate", *arguments).out

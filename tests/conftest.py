@@ -308,7 +308,9 @@ def fork() -> Callable[..., Any]:
     def start(name: str, *words: str, cwd: Path) -> Any:
         def run() -> None:
             server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]  # not in stubs
-            server._forkserver_pid = server._forkserver_alive_fd = None  # that of this process is no child of the new one
+            server._forkserver_pid = server._forkserver_alive_fd = (
+                None  # that of this process is no child of the new one
+            )
             os.setsid()
             os.chdir(cwd)
             torch.set_num_threads(1)

@@ -44,8 +44,7 @@ def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, sums
     assert call("generate", *words("file://" + str(tmp_path / "out"), *options)).code == 0
     assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
     assert (
-        ": 0 pairs made, 6 in total"
-        in call("generate", *words("memory://out", *options, source="memory://frames")).out
+        ": 0 pairs made, 6 in total" in call("generate", *words("memory://out", *options, source="memory://frames")).out
     )
     pairs = PairedFolder("memory://out")
     assert (pairs[3].clean == PairedFolder(tmp_path / "out")[3].clean).all()

@@ -142,6 +142,26 @@ def empty_bucket(protocol: str, environment: dict[str, str]) -> Iterator[dict[st
         yield environment
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _equal_scenes_are_rendered_once() -> Iterator[None]:
+    """Keep small road scenes, of which the data sets of trainings render a few again and again."""
+    module = importlib.import_module("torchrefract.data.road_scenes.render")
+    render = module.render_road_scenes
+
+    @lru_cache
+    def kept(key: int, *size: int, seed: int) -> tuple[Tensor, Tensor]:
+        return render(torch.tensor([key]), *size, seed=seed)
+
+    def render_once(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, ...]:
+        if len(keys) > 1 or height * width > 64 * 128:
+            return render(keys, height, width, seed=seed)
+        return tuple(value.clone() for value in kept(int(keys), height, width, seed=seed))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "render_road_scenes", render_once)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def fresh_compiler(request) -> Iterator[None]:
     """Reset the compiler after tests of graphs: it compiles the shared code of `forward` for eight effects at most."""

@@ -20,8 +20,10 @@ over the draws. "rectified" rows are the same frames after `rectify` by the cali
 --drives degrades the frames of FRAMES/val by `cheap_dashcam`, as a validation of the task undistort does, and estimates
 the flow of each frame alone, by straight edges: the mean of the flows of 256 lenses that the effect draws, weighted by
 their likelihood. "constant" is their mean without weights. For "both" they are weighted also by a normal distribution
-around the flow of the network, of 20 px. --wide takes the wide lens of Table 1 instead. --without leaves out frames
-whose own lens shows, by the beginnings of their names.
+around the flow of the network, of 20 px. --pool sees all frames of a drive through one lens, as a camera does, each
+drive through up to four lenses in turn, and estimates it from all of them: the likelihoods of 2,048 lenses, and the
+mean flow of the network. --wide takes the wide lens of Table 1 instead. --without leaves out frames whose own lens
+shows, by the beginnings of their names.
 
 --clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
 frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
@@ -89,6 +91,7 @@ _POOLS = {1: 7, 5: 5, 20: 3}  # number of draws by the number of frames
 _WIDTH = 1920  # px, of errors
 _GRID = 41
 _NUM_LENSES, _FLOW_STRIDE = 256, 8  # of the prior of single frames; px
+_NUM_POOLED_LENSES, _NUM_DRAWS = 2048, 4  # of the prior of drives; lenses that each drive is seen through
 _NETWORK_PX = 20  # px at 1920, standard deviation of the flow of a network: 1.25 times its mean error of 16 px
 _PRIOR_SEED = 123  # another one than that of the frames
 
@@ -272,9 +275,9 @@ def draw_prior(effect: Effect, size: tuple[int, int], *, count: int) -> EffectPr
     )
 
 
-def costs_of_lenses(gray: np.ndarray, prior: EffectPrior) -> Tensor:
-    """Return the negative log-likelihood (L,) of the lenses of a prior in a picture (H, W)."""
-    chains = pool_chains([find_chains(gray)], (gray.shape[0], gray.shape[1]))
+def costs_of_lenses(grays: Sequence[np.ndarray], prior: EffectPrior) -> Tensor:
+    """Return the negative log-likelihood (L,) of the lenses of a prior in pictures (H, W) of one camera."""
+    chains = pool_chains([find_chains(gray) for gray in grays], (grays[0].shape[0], grays[0].shape[1]))
     return torch.cat([line_costs(chains, lenses) for lenses in prior.lenses.split(16)]).sum(dim=1)
 
 
@@ -290,24 +293,36 @@ def held_out(
     *,
     effect: Effect | None = None,
     network: Network | None = None,
+    pool: bool = False,
 ) -> list[dict[str, Any]]:
-    """Estimate the flow of each frame of held-out drives alone; return and print errors, px of a frame 1920 px wide."""
+    """Estimate the flow of each frame of held-out drives alone, or of all frames of a drive together.
+
+    Returns and prints errors, px of a frame 1920 px wide.
+    """
     frames, effect, rows = FrameFolder(root, size=size, split="val"), effect or cheap_dashcam(), list[dict[str, Any]]()
-    prior = draw_prior(effect, size, count=_NUM_LENSES)
+    prior = draw_prior(effect, size, count=_NUM_POOLED_LENSES if pool else _NUM_LENSES)
+    mean, scale = prior.flows.mean(dim=0), _WIDTH / size[1]
+    groups: dict[str, list[int]] = {}
     for i, path in enumerate(frames.paths):
         if not path.name.startswith(tuple(without)):
-            pair = effect.degrade(frames[i].image[None], seed=0, keys=[frames.keys[i]])  # the draws of a validation
-            true, mean = sparse(pair.restore_flow)[0], prior.flows.mean(dim=0)
-            costs, scale = costs_of_lenses(to_gray(pair.image[0]), prior), _WIDTH / size[1]
+            name = frames.drive_names[i] if pool else path.relative_to(root).as_posix()
+            groups.setdefault(name, []).append(i)
+    for name, members in groups.items():
+        for key in [frames.keys[i] for i in members[:_NUM_DRAWS]]:  # a frame alone has the draw of a validation
+            pairs = [effect.degrade(frames[i].image[None], seed=0, keys=[key]) for i in members]
+            true = sparse(pairs[0].restore_flow)[0]
+            costs = costs_of_lenses([to_gray(pair.image[0]) for pair in pairs], prior)
             flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(costs, prior)}
             if network:
-                flows["network"] = sparse(resize_flow(network.predict(pair.image), size))[0]
+                predicted = [sparse(resize_flow(network.predict(pair.image), size)) for pair in pairs]
+                flows["network"] = torch.cat(predicted).mean(dim=0)
                 distance = scale * (prior.flows - flows["network"]).norm(dim=1).mean(dim=(1, 2))
                 flows["both"] = posterior_flow(costs + (distance / _NETWORK_PX).square() / 2, prior)
-            error = {name: scale * (flow - true).norm(dim=0).mean().item() for name, flow in flows.items()}
-            rows.append({"frame": path.relative_to(root).as_posix(), **error})
-    means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0] if name != "frame"}
-    print(f"{len(rows)} frames", *(f"{name} {value:.2f}" for name, value in means.items()), sep="  ")
+            error = {kind: scale * (flow - true).norm(dim=0).mean().item() for kind, flow in flows.items()}
+            rows.append({"frame": name, **error})
+    means = {kind: sum(row[kind] for row in rows) / len(rows) for kind in rows[0] if kind != "frame"}
+    unit = f"lenses of {len(groups)} drives" if pool else "frames"
+    print(f"{len(rows)} {unit}", *(f"{kind} {value:.2f}" for kind, value in means.items()), sep="  ")
     return rows
 
 
@@ -363,6 +378,7 @@ def main() -> None:
         "--size", nargs=2, type=count(1), default=[352, 616], help="height and width of those frames, px"
     )
     parser.add_argument("--wide", action="store_true", help="degrade them by the wide lens of Table 1 instead")
+    parser.add_argument("--pool", action="store_true", help="estimate one lens for all frames of a drive")
     parser.add_argument("--without", nargs="+", default=[], help="beginnings of the names of frames to leave out")
     parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--out", type=Path, default=RESULTS / "lens_estimation.json")
@@ -382,7 +398,8 @@ def main() -> None:
         parser.error("--clip needs --checkpoint, such as lens_small")
     if arguments.drives:
         effect = wide_lens() if arguments.wide else cheap_dashcam()
-        rows = held_out(arguments.drives, tuple(arguments.size), arguments.without, effect=effect, network=network)
+        size, options = tuple(arguments.size), {"effect": effect, "network": network, "pool": arguments.pool}
+        rows = held_out(arguments.drives, size, arguments.without, **options)
         return write_json(arguments.out.with_name("held_out.json"), rows)
     if arguments.data:
         rows = real(arguments.data, arguments.sets, network)

@@ -382,13 +382,13 @@ def _without_place(arguments: dict[str, Any]) -> dict[str, Any]:
 def _cheap_lens(severity: int, **arguments: Any) -> LensDistortion:
     k1, k2 = _at_severity(
         severity,
-        # k2 >= 0.45 k1^2: r (1 + k1 r^2 + k2 r^4) increases for every r.
+        # The slope of r (1 + k1 r^2 + k2 r^4) is at least 1 - 0.45 k1^2 / k2 >= 0.08, so that no lens is near a fold.
         [
             ((-0.10, -0.03), (0.005, 0.02)),
             ((-0.20, -0.10), (0.02, 0.05)),
             ((-0.35, -0.15), (0.06, 0.12)),
             ((-0.45, -0.35), (0.10, 0.16)),
-            ((-0.60, -0.45), (0.17, 0.24)),
+            ((-0.60, -0.45), (0.18, 0.24)),
         ],
     )
     options: dict[str, Any] = {"k1_range": k1, "k2_range": k2, "focal_range": (0.7, 1.1)}

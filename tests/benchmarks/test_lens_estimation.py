@@ -70,11 +70,11 @@ def test_lines_of_one_frame_choose_among_the_lenses_of_an_effect():
     effect, size = cheap_dashcam(), (216, 384)
     prior = lens_estimation.draw_prior(effect, size, count=64)
     assert prior.lenses.shape == (64, 2)
-    flow = lens_estimation.posterior_flow(lens_estimation.costs_of_lenses(np.zeros(size, np.uint8), prior), prior)
+    flow = lens_estimation.posterior_flow(lens_estimation.costs_of_lenses([np.zeros(size, np.uint8)], prior), prior)
     torch.testing.assert_close(flow, prior.flows.mean(dim=0))  # a frame without edges tells nothing
     clean = torch.from_numpy(poles(*size)).permute(2, 0, 1)[None] / 255
     degraded = effect.degrade(clean, seed=1, keys=[5])
-    costs = lens_estimation.costs_of_lenses(lens_estimation.to_gray(degraded.image[0]), prior)
+    costs = lens_estimation.costs_of_lenses([lens_estimation.to_gray(degraded.image[0])], prior)
     flow = lens_estimation.posterior_flow(costs, prior)
     true = lens_estimation.sparse(degraded.restore_flow)[0]
     assert (flow - true).norm(dim=0).mean() < 0.25 * (prior.flows.mean(dim=0) - true).norm(dim=0).mean()
@@ -102,3 +102,20 @@ def test_a_network_that_is_right_improves_on_the_lines_of_a_frame(tmp_path, monk
     (row,) = lens_estimation.held_out(tmp_path, (144, 256), network=network)
     assert row["network"] == pytest.approx(0, abs=1e-3)
     assert row["both"] < 0.7 * row["lines"]
+
+
+def test_pooled_frames_of_a_drive_have_one_lens_and_tell_more_of_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 32)
+    monkeypatch.setattr(lens_estimation, "_NUM_POOLED_LENSES", 32)
+    for name in ("train/a_1.png", "val/b_1.png", "val/b_2.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        picture = poles(144, 256) if name == "val/b_1.png" else np.zeros((144, 256, 3), np.uint8)  # without lines
+        cv2.imwrite(str(tmp_path / name), picture)
+    alone = lens_estimation.held_out(tmp_path, (144, 256))
+    pooled = lens_estimation.held_out(tmp_path, (144, 256), pool=True)
+    assert [row["frame"] for row in pooled] == ["b", "b"]
+    # The first is seen through the lens of the first frame alone, in whose picture the other one adds nothing.
+    assert pooled[0]["nothing"] == pytest.approx(alone[0]["nothing"])
+    assert pooled[0]["lines"] == pytest.approx(alone[0]["lines"], rel=0.05)
+    assert pooled[1]["lines"] < 0.5 * alone[1]["lines"]
+    assert "2 lenses of 1 drives" in capsys.readouterr().out

@@ -126,6 +126,15 @@ def test_pixels_beyond_a_fold_are_padded_and_invalid_after_one_warning():
     assert (r > 1.03 * edge).any()
 
 
+def test_a_ring_near_a_fold_whose_border_has_a_source_is_reported():
+    image = torch.ones(1, 1, 108, 192)
+    ring = LensDistortion(k1_range=(-0.6, -0.6), k2_range=(0.17, 0.17), focal_range=(0.88, 0.88))
+    with pytest.warns(UserWarning, match="must not fold back inside the frame"):
+        degraded = ring.degrade(image, seed=0)
+    assert degraded.valid[..., [0, -1], :][..., [0, -1]].all()
+    assert 0 < (~degraded.valid).sum() < 200
+
+
 @pytest.mark.parametrize("around", [lambda lens: Compose([lens]), lambda lens: OneOf([lens, lens])])
 def test_a_fold_is_reported_inside_a_composition_too(around):
     image = torch.ones(2, 1, 36, 64)

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from torchrefract.cameras.brown_conrady import ALL_TERMS, POLYNOMIAL12, Terms, distort_polynomial
 from torchrefract.fields import lens_error
-from torchrefract.fields.lens import folds_inside, frame_limit, lens_flow, lens_restore_flow, newton_lens_flow
+from torchrefract.fields.lens import frame_limit, lens_flow, lens_restore_flow, misses_in_frame, newton_lens_flow
 from torchrefract.warping.grid import Points, inside
 from torchrefract.warping.lattice import Lattice, pixel_lattice
 
@@ -166,12 +166,22 @@ def test_beyond_the_fold_positions_are_outside_and_masked(pixels, dtype):
 
 
 @pytest.mark.parametrize(
-    ("names", "folds"), [({"k1": -0.3}, True), ({"p2": 0.3}, True), ({"k1": -0.1, "p2": 0.01}, False)]
+    ("names", "misses"),
+    [
+        ({"k1": -0.3}, True),
+        ({"p2": 0.3}, True),
+        ({"k1": -0.1, "p2": 0.01}, False),
+        ({"k1": -0.6, "k2": 0.17}, True),  # a ring that is magnified by 32 or more
+    ],
 )
-def test_a_fold_inside_the_frame_shows_at_its_border(names, folds):
-    at = camera(names, (40.0, 40.0), (31.5, 17.5))
-    assert folds_inside(*at, height=36, width=64).item() == folds
-    assert lens_flow(*at, points=pixel_points(36, 64))[1].all().item() != folds
+def test_a_point_without_a_preimage_counts_inside_the_frame_alone(names, misses):
+    coefficients, focal, center = (value.float() for value in camera(names, (40.0, 40.0), (31.5, 17.5)))
+    points = pixel_points(36, 64, torch.float32)
+    exists = lens_flow(coefficients, focal, center, points)[1]
+    assert exists.all().item() != misses
+    assert misses_in_frame(exists, points).item() == misses
+    outside = points.displaced(torch.full((1, 2, 36, 64), 64.0))
+    assert not misses_in_frame(exists, outside).item()
 
 
 def test_a_principal_point_outside_the_frame_follows_opencv(pixels):

@@ -26,7 +26,7 @@ from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
-from torchrefract.fields.lens import folds_inside, lens_flow, lens_restore_flow, newton_lens_flow
+from torchrefract.fields.lens import lens_flow, lens_restore_flow, misses_in_frame, newton_lens_flow
 from torchrefract.fields.lens_error import LensErrorModel, LensRanges
 from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
@@ -257,7 +257,7 @@ class LensDistortion(WarpEffect):
         if plan.details is None:
             flow, exists = lens_flow(*lens, points)
             if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
-                self._report_fold(params, height, width)
+                self._report_fold(params, exists, points)
         else:
             steps = plan.details.steps_for(points.lattice.stride)
             terms = ALL_TERMS if requires_grad(lens[:1]) else plan.details.terms
@@ -347,11 +347,8 @@ class LensDistortion(WarpEffect):
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
         return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
 
-    def _report_fold(self, params: LensParams, height: int, width: int) -> None:
-        lens = lens_in_px(params, height, width)
-        folds = eager_values(
-            lambda: params.applied & folds_inside(*lens, height=height, width=width), of=params.applied
-        )
+    def _report_fold(self, params: LensParams, exists: Tensor, points: Points) -> None:
+        folds = eager_values(lambda: params.applied & misses_in_frame(exists, points), of=params.applied)
         if not folds or not any(folds):
             return
         rule = "the lens must not fold back inside the frame (k1, k2 ... and focal_range decide)"

@@ -102,12 +102,11 @@ def frame_limit(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: 
     return radial_limit(coefficients.detach()[:, :, None, None, None], REACH * corner, 1.1 * corner)
 
 
-def folds_inside(coefficients: Tensor, focal: Tensor, center: Tensor, *, height: int, width: int) -> Tensor:
-    """Return (B,), bool: part of the border of the frame has no preimage; arguments as for `lens_flow`."""
-    limit = frame_limit(coefficients, focal, center, height=height, width=width)
-    c = coefficients.detach()[:, :, None, None, None]
-    x_d, y_d = border_on_plane(focal.detach(), center.detach(), height, width)
-    return ~undistort_polynomial(x_d, y_d, c, limit=limit)[2].flatten(1).all(dim=1)
+def misses_in_frame(exists: Tensor, points: Points) -> Tensor:
+    """Return (B,), bool: a point inside of the frame has no preimage; `exists` as from `lens_flow` at the points."""
+    last_x, last_y = points.lattice.width - 1, points.lattice.height - 1
+    is_inside = (points.x >= 0) & (points.x <= last_x) & (points.y >= 0) & (points.y <= last_y)
+    return (is_inside & ~exists).flatten(1).any(dim=1)
 
 
 def border_on_plane(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -264,33 +264,26 @@ def test_initial_weights_of_another_model_are_one_line_of_error(call, small, wor
     ("words", "message"),
     [
         (
-            ("+task=undistort", "scene=cape_town_fog"),
+            ("scene=cape_town_fog",),
             "data: effect must have a flow, as a lens has, got HeterogeneousFog",
         ),
         (
-            ("+task=deweather", "task.transmission_head=true", "scene=cheap_dashcam"),
-            "data: effect must have a transmission, as fog has, got LensDistortion",
-        ),
-        (
-            ("+task=undistort", "scene=paper_refractive", "data.border=black"),
+            ("scene=paper_refractive", "data.border=black"),
             "data: border must be null unless the scene is a lens that fills its frames, got black",
         ),
-        (("+task=undistort", "run_dir=/dev/null/run"), "run_dir: "),
-        (("+task=undistort", "model.lr=nan"), "model: lr must not be NaN, got nan"),
-        (("+task=undistort", "model.weight_decay=-1"), "model: weight_decay must be a number of at least 0, got -1"),
-        (("+task=undistort", "model.warmup_steps=-1"), "model: warmup_steps must be at least 0, got -1"),
-        (("+task=undistort", "model.metric_size=[1080]"), "model: metric_size must be (height, width), got [1080]"),
-        (("+task=undistort", "trainer.max_epochs=2.5"), "trainer: max_epochs must be a whole number, got 2.5"),
-        (("+task=undistort", "trainer.accelerator=tpu"), "trainer: "),
-        (("+task=undistort", "trainer.max_epochs=-1", "+trainer.max_time=00:00:00:05"), "schedule must be plateau "),
-        (("+task=undistort", "hydra.run.dir=/dev/null/run"), "/dev/null/run could not be written: "),
-        (("+task=undistort", *DDPM, "model.steps=0"), "model: steps must be at least 1, got 0"),
-        (("+task=undistort", *DDPM, "model.network.pretrained=./none"), "model: pretrained must be null, a folder "),
+        (("run_dir=/dev/null/run",), "run_dir: "),
+        (("model.lr=nan",), "model: lr must not be NaN, got nan"),
+        (("model.weight_decay=-1",), "model: weight_decay must be a number of at least 0, got -1"),
+        (("model.warmup_steps=-1",), "model: warmup_steps must be at least 0, got -1"),
+        (("model.metric_size=[1080]",), "model: metric_size must be (height, width), got [1080]"),
+        (("trainer.max_epochs=2.5",), "trainer: max_epochs must be a whole number, got 2.5"),
+        (("trainer.accelerator=tpu",), "trainer: "),
+        (("trainer.max_epochs=-1", "+trainer.max_time=00:00:00:05"), "schedule must be plateau "),
+        (("hydra.run.dir=/dev/null/run",), "/dev/null/run could not be written: "),
     ],
 )
 def test_an_invalid_option_is_one_line_of_error(call, small, words, message):
-    options = [word for word in small if not word.startswith("model.")] if "model=ddpm_image" in words else small
-    assert call("train", *options, *words).message.startswith(message)
+    assert call("train", "+task=undistort", *small, *words).message.startswith(message)
 
 
 def test_a_metric_that_no_validation_has_is_one_line_of_error(call, small):

@@ -178,13 +178,13 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_any_name_of_a_file_reaches_the_configuration_unchanged(tmp_path, monkeypatch, name):
+def test_any_name_of_a_picture_reaches_the_configuration_unchanged(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path(name).touch()
-    (word,) = prepare_arguments("preview", [name])
     with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-        assert compose("preview", overrides=[word]).image == name
+        for name in NAMES:
+            Path(name).touch()
+            (word,) = prepare_arguments("preview", [name])
+            assert compose("preview", overrides=[word]).image == name
 
 
 def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path):

@@ -50,8 +50,6 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("tar=0", "tar must be at least 1, got 0"),
         ("workers=-1", "workers must be at least 0, got -1"),
         ("seed=3000000000", "seed must be below 2147483648, got 3000000000"),
-        ("val_share=1", "val_share must be between 0 and 1, got 1.0"),
-        ("drive_by=car", "drive_by must be one of auto, folder, prefix, got 'car'"),
         ("verify=7", "verify must be True or False, got 7"),
         ("scene.severity=9", "scene: severity must be one of 1, 2, 3, 4, 5, got 9"),
     ],

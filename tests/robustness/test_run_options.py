@@ -289,16 +289,6 @@ def test_a_run_is_not_continued_with_another_camera_or_horizon(call, tmp_path, f
     )
 
 
-def test_a_run_of_an_earlier_version_without_a_camera_continues(call, tmp_path, frames):
-    words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out")
-    assert call(*words).code == 0
-    path = tmp_path / "out" / "scores.jsonl"
-    settings, *rows = path.read_text().splitlines(keepends=True)
-    settings = {name: value for name, value in json.loads(settings).items() if name not in ("camera", "horizon")}
-    path.write_text(json.dumps(settings) + "\n" + "".join(rows))
-    assert call(*words).code == 0
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

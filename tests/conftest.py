@@ -23,9 +23,9 @@ from torchrefract.cameras.projection import undistort
 
 # Files of slow tests, the slowest first, which would leave one process of pytest-xdist alone if they ran last.
 SLOW_FILES = (
-    *("effects/test_contract.py", "test_train.py", "data/test_two_nodes.py", "data/pairs/test_runs.py"),
-    *("cli/test_preview.py", "effects/test_compose.py", "test_calibrate.py", "test_examples.py", "test_export.py"),
-    "benchmarks/test_table1.py",
+    *("effects/test_contract.py", "test_train.py", "effects/test_compose.py", "test_calibrate.py"),
+    *("cli/test_preview.py", "test_export.py", "test_examples.py", "test_package.py", "benchmarks/test_table1.py"),
+    "robustness/test_run_options.py",
 )
 
 

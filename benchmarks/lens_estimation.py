@@ -189,7 +189,7 @@ def measure(
             row = Row(name, method, number, median(error), nothing[0], sum(distinct) / draws, median(straight))
             rows.append(row)
             print(
-                f"{name:26}{number:4} frames  {method:8}error {row.error:6.1f}  nothing {row.nothing:6.1f}  "
+                f"{name:26}{number:4} frames  {method:9}error {row.error:6.1f}  nothing {row.nothing:6.1f}  "
                 f"distinct in {row.distinct:4.0%}  straight edges {row.straight:4.0f}",
                 flush=True,
             )

@@ -88,7 +88,10 @@ TINY = {
     ("segformer", "undistort"): ["model.network.encoder=mit_b0"],
     ("fog_net", "deweather"): ["model.network.width=4"],
     ("lens_net", "undistort"): ["model.network.weightings=2", "model.network.lenses=3"],
-    ("ddpm", "undistort"): ["model.network.weightings=2", "model.network.lenses=3", "model.samples=2"],
+    ("ddpm", "undistort"): [
+        *("model.network.weightings=2", "model.network.lenses=3"),
+        *("model.samples=2", "model.components=1"),
+    ],
     ("ddpm_image", "undistort"): [*DENOISER, "model.network.attention=[false,true]"],
     ("ddpm_cat256", "deweather"): [*DENOISER, "model.network.attention=[true,false]"],
     ("bridge", "deweather"): [*DENOISER, "model.network.attention=[false,true]"],

@@ -57,6 +57,15 @@ def test_frames_of_a_video_are_evenly_spaced_and_a_blank_one_is_warned_of(call, 
     assert vague.startswith("warning: the lens cannot be distinguished from no distortion (95 %)")
 
 
+def test_a_damaged_video_is_named_and_the_others_are_used(call, folder):
+    (folder / "raw" / "bad.mp4").write_bytes(b"no video")
+    outcome = call("estimate_lens", "input=raw")
+    assert "from 6 frames" in outcome.out
+    assert outcome.err.splitlines()[0].startswith("skipped: raw/bad.mp4 is not a video with a frame that")
+    last = call("estimate_lens", "input=raw/bad.mp4").err.splitlines()[-1]
+    assert last.startswith("error: input must hold a readable picture or video, got raw/bad.mp4 is not a video with")
+
+
 def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
     alone = call("estimate_lens", "input=raw", "out=a.yaml").out.removeprefix("a.yaml")
     both = call("estimate_lens", "input=raw", "out=b.yaml", f"checkpoint={shifted}").out.removeprefix("b.yaml")
@@ -71,14 +80,22 @@ def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
     ("words", "message"),
     [
         (("input=raw", "frames=0"), "frames must be at least 1, got 0"),
-        (("input=raw", "fov_deg=180"), "input: fov_deg must be a number in [1, 170], got 180"),
-        (("input=raw", "out=cam.txt"), "out: path must end in .xml, .yml or .yaml, got cam.txt"),
+        (("input=raw", "fov_deg=180"), "fov_deg must be a number in [1, 170], got 180"),
+        (("input=raw", "fov_deg=wide"), "fov_deg must be a real number, got 'wide'"),
+        (("input=raw", "out=cam.txt"), "out must end in .xml, .yml or .yaml, got cam.txt"),
+        (("input=raw", "out=raw"), "out must end in .xml, .yml or .yaml, got raw"),
+        (("input=raw", "out=raw/0.png/cam.yaml"), "out: [Errno 17] File exists: 'raw/0.png'"),
         (("input=nothing",), "input must be a folder, a picture or a video, got nothing, which does not exist"),
-        (("input=raw", "checkpoint=none.ckpt"), "ckpt_path must be a checkpoint file"),
+        (("input=raw", "checkpoint=none.ckpt"), "checkpoint must be a checkpoint file, such as "),
+        (("input=raw", "checkpoint=raw/0.png"), "checkpoint must be an intact checkpoint, got raw/0.png, "),
     ],
 )
-def test_an_invalid_option_is_one_line_of_error(call, folder, words, message):
-    assert message in call("estimate_lens", *words).message
+def test_an_invalid_option_is_one_line_of_error_before_frames_are_read(call, folder, monkeypatch, words, message):
+    def refuse(*_, **__):
+        raise AssertionError("the frames were read")
+
+    monkeypatch.setattr("torchrefract.cli.lens.read_image", refuse)
+    assert call("estimate_lens", *words).message.startswith(message)
 
 
 def test_pictures_of_two_sizes_and_a_checkpoint_of_another_task_are_errors(call, folder, brighter):

@@ -72,6 +72,54 @@ def test_the_standard_deviation_of_a_flow_is_printed_in_px_of_the_frames(call, f
     assert float(deviation[1]) == pytest.approx(96 / 20, rel=0.2)  # of 64 samples
 
 
+def test_maps_of_the_standard_deviation_lie_beside_the_pictures_of_a_model_that_samples(call, folder, undecided):
+    words = (f"ckpt_path={undecided}", "input=raw", "out=out")
+    assert call("restore", *words).code == 0
+    assert written(folder / "out") == sorted([*SIZES, "config.json"])
+    plain = {name: (folder / "out" / name).read_bytes() for name in SIZES}
+    outcome = call("restore", *words, "deviation=true")  # adds them to a folder without
+    assert outcome.out.splitlines()[0] == "out: 4 restored, 0 already existed, 0 skipped"
+    maps = {name: name.rsplit(".", 1)[0] + ".deviation.png" for name in SIZES}
+    assert written(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
+    assert {name: (folder / "out" / name).read_bytes() for name in SIZES} == plain
+    levels = {name: np.array(Image.open(folder / "out" / maps[name])) for name in SIZES}
+    for name, size in SIZES.items():
+        assert (levels[name].shape, levels[name].dtype) == (size, np.uint16)
+        assert (levels[name] == levels[name][0, 0]).all()  # a constant shift
+        assert levels[name][0, 0] / 256 == pytest.approx(size[1] / 20, rel=0.3)  # of 64 samples
+    deviation = re.search(r"^standard deviation of the flow: (\d+\.\d) px", outcome.out, re.MULTILINE)
+    assert deviation
+    assert float(deviation[1]) == pytest.approx(np.median([value[0, 0] / 256 for value in levels.values()]), abs=0.06)
+    (folder / "out" / maps["one/b.png"]).unlink()
+    assert "1 restored, 3 already existed" in call("restore", *words, "deviation=true").out
+    assert written(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
+
+
+def test_maps_of_the_standard_deviation_that_cannot_be_written_are_one_line_of_error(
+    call, folder, undecided, shifted, brighter
+):
+    (folder / "clip").mkdir()
+    clip(folder / "clip" / "a.avi", 2)
+    for name in ("a.png", "a.bmp"):
+        write(folder / "twice" / name, picture(8, 8))
+    single = f"ckpt_path={undecided}", "+model.samples=1"
+    rule = (
+        "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at least "
+    )
+    for words, message in (
+        ((f"ckpt_path={shifted}", "input=raw"), rule),
+        ((f"ckpt_path={brighter}", "input=raw"), rule),
+        ((*single, "input=raw"), rule),
+        ((f"ckpt_path={undecided}", "input=clip"), "deviation must be false for videos, got true with clip/a.avi"),
+        ((f"ckpt_path={undecided}", "input=raw", "pool=lens"), rule),
+        ((f"ckpt_path={undecided}", "input=twice"), "deviation must have a name for each map, got twice/a.bmp and "),
+        ((f"ckpt_path={undecided}", "input=raw", "deviation=2"), "deviation must be True or False, got 2"),
+    ):
+        assert call("restore", "deviation=true", *words).message.startswith(message)
+        assert not (folder / "restored").exists()
+    assert "standard deviation" not in call("restore", *single, "input=raw", "out=out").out
+
+
 def test_pooled_frames_of_a_camera_are_restored_along_one_flow(call, tmp_path, drive, shifted):
     for i, frame in enumerate(drive((-0.16, 0.06), 6)):
         write(tmp_path / "raw" / f"{i}.png", pixels_of(frame)[..., ::-1])

@@ -1,6 +1,7 @@
 import csv
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -99,6 +100,14 @@ def test_a_network_of_lenses_says_so_for_other_warps(call):
     data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
     haze = call("train", "+task=undistort", "scene=highveld_heat_haze", *data, "trainer.max_epochs=1").out
     assert "severity 3; lens_net predicts the flow of a lens alone: add model=resunet for other warps" in haze
+
+
+def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call):
+    data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
+    dust = call("train", "+task=deweather", "scene=unpaved_road", *data, "trainer.max_epochs=1").out
+    assert "severity 3; it moves pixels too, which deweather does not undo: that takes +task=undistort" in dust
+    fog = call("train", "+task=deweather", "scene=cape_town_fog", *data, "trainer.max_epochs=1").out
+    assert "severity 3\n" in fog
 
 
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
@@ -233,6 +242,17 @@ def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(fo
 def test_a_finished_run_cannot_be_resumed(call, trained):
     message = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run").message
     assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"
+
+
+def test_a_new_training_does_not_replace_the_checkpoints_of_another_one(call, trained, tmp_path):
+    shutil.copytree(trained.folder, tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    message = call("train", *trained.words, "seed=3", "run_dir=run").message
+    assert message == (
+        "run_dir must be a folder without the checkpoints of another training, got run: ckpt_path=run/last.ckpt "
+        "continues that one, and another run_dir keeps it"
+    )
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
 def test_a_training_starts_with_the_weights_and_the_licenses_of_a_checkpoint(call, trained):

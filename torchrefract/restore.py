@@ -12,8 +12,9 @@ Options:
                             does not shake; lens: one for all files, of one camera; null: each frame alone
     interpolation=bicubic   of the warp along a predicted flow; or bilinear
     side_by_side=false      true writes the input to the left of the restoration
-    batch=4                 pictures, frames or tiles that are restored together
-    device=auto             cpu, cuda, or auto, which prefers cuda
+    deviation=false         true writes the standard deviation of the flow of a diffusion model beside each picture, as
+                            NAME.deviation.png, a gray PNG of 16 bits in steps of 1/256 px
+    batch=4                 pictures, frames or tiles that are restored together; device=cpu or cuda: where
 
 Examples:
     python -m torchrefract.restore ckpt_path=best.ckpt input=drive.mp4 side_by_side=true

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import references
 import torch
-from references import REFERENCES, distances
+from references import REFERENCES, contrast, distances
 
 
 @pytest.mark.quick
@@ -29,6 +29,25 @@ def test_a_pattern_that_names_no_clear_frames_is_an_error(monkeypatch, shared_da
     with pytest.raises(SystemExit):
         references.main()
     assert f"--clear must name pictures in {shared_data}, got none for frames/none*" in capsys.readouterr().err
+
+
+def test_a_checkpoint_is_scored_by_the_contrast_of_real_pictures_before_and_after(
+    monkeypatch, shared_data, known_model, capsys
+):
+    checkpoint = known_model("deweather", (0.2, 0.2, 0.2))  # more light with the same differences
+    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(shared_data), "--restore", str(checkpoint)])
+    references.main()
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [name for name, *_ in rows] == ["haze", "fog", "clear"]
+    for _, before, after in rows:
+        assert 0 < float(after) < float(before) < 1
+
+
+@pytest.mark.quick
+def test_the_contrast_of_a_picture_is_the_mean_deviation_of_luma_relative_to_its_mean():
+    stripes = torch.tensor([0.2, 0.6]).repeat(32).expand(3, 48, 64)
+    assert contrast(stripes) == pytest.approx(0.5, rel=0.02)  # +- 0.2 around 0.4, in windows of 4 or 5 stripes
+    assert contrast(torch.full((3, 48, 64), 0.4)) == pytest.approx(0, abs=1e-3)
 
 
 def test_every_reference_has_its_pictures(shared_data: Path):

@@ -8,9 +8,11 @@ from helpers import random_image
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import Compose, GroundPlaneDepth, LensDistortion, UniformFog
+from torchrefract import Compose, GroundPlaneDepth, LensDistortion, RollingShutter, Turbulence, UniformFog
+from torchrefract._tensor import sharing_results
 from torchrefract.effects.batch import ParamsAtDepth, params_to
 from torchrefract.effects.warp_effect import WarpEffect
+from torchrefract.fields.random_field import sum_of_waves
 from torchrefract.warping.implicit import sample_at
 from torchrefract.warping.lattice import Lattice, pixel_lattice
 
@@ -112,3 +114,19 @@ def test_maps_are_sampled_bilinearly_at_points_inside_and_outside_of_the_frame()
             assert_close(sample_at(ramp, at), expected)
             rows = (3 * at.y).expand(1, 1, *lattice.num_nodes)
             assert_close(sample_at(3 * y[None, None], at).expand_as(rows), rows)
+
+
+def test_the_severities_of_a_scene_share_the_field_of_their_turbulence(monkeypatch):
+    computed = []
+
+    def counted(*given: Any) -> Tensor:
+        computed.append(given)
+        return sum_of_waves(*given)
+
+    monkeypatch.setattr("torchrefract.fields.random_field.sum_of_waves", counted)
+    image = random_image(1, 3, 90, 160)
+    with sharing_results():
+        for readout in (-10.0, -15.0, -20.0):  # each leads somewhat farther outside of the frame
+            shutter = RollingShutter(speed_range=(60.0, 60.0), readout_range=(readout, readout))
+            Compose([Turbulence(depth=GroundPlaneDepth()), shutter], tolerance_px=None).degrade(image, seed=1)
+    assert len(computed) == 1

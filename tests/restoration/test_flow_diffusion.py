@@ -1,3 +1,4 @@
+import re
 from functools import partial
 from typing import Any
 
@@ -8,6 +9,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from torchrefract import LensDistortion, Pair
+from torchrefract._validation import UsageError
 from torchrefract.restoration.flow_diffusion import FlowDiffusion, fit_polynomial
 from torchrefract.restoration.models.coordconv import cell_axes, polynomial_basis
 from torchrefract.restoration.models.denoiser import LensDenoiser
@@ -66,6 +68,19 @@ def test_two_deviations_of_a_lens_of_known_posterior_cover_95_percent_in_4_steps
         assert (mean - posterior[rows, 0]).square().mean().sqrt() < 0.7 * posterior[rows, 1].mean()
 
 
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")  # as above
+def test_a_first_batch_with_too_few_lenses_for_the_components_is_an_error(trainer, loader):
+    model = FlowDiffusion(small, Undistort(0.25), components=4)
+    model.network.encoder = FirstPixel()
+    message = (
+        "data.batch_size must be above model.components=4, which are those of the lenses of the first batch, got 4"
+    )
+    with pytest.raises(UsageError, match=re.escape(message)):
+        trainer(max_steps=1).fit(model, loader([toy(0, 4)[0]]), loader([toy(0, 4)[0]]))
+    trainer(max_steps=1).fit(model, loader([toy(0, 5)[0]]), loader([toy(0, 4)[0]]))
+    assert (model.components.square().sum(dim=1) > 0).all()
+
+
 def test_coefficients_hold_the_flow_of_a_lens_also_where_it_is_not_valid(make_batches):
     batch = make_batches(LensDistortion(), 2, size=(96, 160))[0]
     coefficients = fit_polynomial(batch).unflatten(1, (2, -1))
@@ -86,8 +101,10 @@ def test_a_sample_depends_on_its_key_alone_and_a_single_one_has_no_deviation():
         assert value.abs().mean() > 1e-3
     with torch.autocast("cpu", torch.bfloat16):
         assert_close(model(image, torch.tensor([5, 6, 7])).flow, restored.flow, rtol=1e-3, atol=1e-4)
+    assert model.has_deviation
     model.samples = 1
-    assert not model(image).deviation.any()
+    assert not model.has_deviation
+    assert model(image).deviation is None
 
 
 def test_an_untrained_denoiser_knows_only_that_the_numbers_are_standard_normal():

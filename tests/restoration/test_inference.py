@@ -87,6 +87,21 @@ def test_a_change_of_brightness_is_constant_and_the_result_stays_in_range():
     assert (restored.min(), restored.max()) == (0, 1)
 
 
+def test_the_deviation_of_a_flow_is_that_of_the_px_of_each_picture():
+    def deviate(small: Tensor) -> Restored:
+        flow = stretch(*small.shape[2:]).expand(len(small), -1, -1, -1)
+        return Restored(warp(small, flow, padding="border")[0], flow, deviation=torch.ones_like(flow))
+
+    restorer, images = Restorer(deviate, size=(16, 28)), [picture(48, 56), picture(16, 28, 1)]
+    wide, small = restorer.restore(images)
+    assert wide.deviation is not None
+    assert_close(wide.deviation, torch.tensor([2.0, 3.0]).view(1, 2, 1, 1).expand(1, 2, 48, 56))
+    assert_close(small.deviation, torch.ones(1, 2, 16, 28))
+    assert restorer.deviations == pytest.approx([13**0.5, 2**0.5])
+    for image, full in zip(restorer(images), (wide, small), strict=True):
+        assert torch.equal(image, full.image[0])
+
+
 def test_a_model_that_predicts_a_flow_has_no_tiles():
     with pytest.raises(ValueError, match=r"^tile must be None for a model that predicts a flow"):
         Restorer(restore_by_flow, size=(16, 28), tile=(8, 8))([picture(20, 20)])

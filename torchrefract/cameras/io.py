@@ -39,6 +39,7 @@ from torchrefract.cameras.lens_profiles import (
 )
 
 __all__ = [
+    "OPENCV_SUFFIXES",
     "read_camera",
     "read_colmap",
     "read_covariance",
@@ -51,6 +52,7 @@ __all__ = [
     "write_ros",
 ]
 
+OPENCV_SUFFIXES = (".xml", ".yml", ".yaml")  # of the files that `write_opencv` writes
 _ROS_MODELS = {"plumb_bob": "opencv", "rational_polynomial": "opencv", "equidistant": "fisheye"}
 _KALIBR_MODELS = {"radtan": "opencv", "equidistant": "fisheye", "none": "opencv"}
 # Names for the matrix of the pinhole and for the coefficients, in any case, with or without underscores.
@@ -384,6 +386,6 @@ def _matrix(rows: int, values: Iterable[float]) -> dict[str, Any]:
 
 
 def _is_xml(path: Path) -> bool:
-    if path.suffix.lower() not in (".xml", ".yml", ".yaml"):
+    if path.suffix.lower() not in OPENCV_SUFFIXES:
         raise ValueError(f"path must end in .xml, .yml or .yaml, got {path}")
     return path.suffix.lower() == ".xml"

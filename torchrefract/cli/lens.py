@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchrefract._validation import UsageError, check_count
 from torchrefract.cameras.calibration import estimate_lens as estimate
+from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.io import write_opencv
+from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
 from torchrefract.cli.command import find_device, naming, progress
 from torchrefract.data import media
 from torchrefract.data.images import UnreadableImageError, read_image
@@ -26,11 +27,16 @@ def estimate_lens(cfg: DictConfig) -> None:
     """Estimate the lens of the camera of pictures and videos, write the camera, and print how certain it is."""
     with naming("frames"):
         max_frames = check_count("frames", cfg.frames)
+    with naming("fov_deg"):
+        focal_of_view(cfg.fov_deg)
+    out = Path(str(cfg.out))
+    if out.suffix.lower() not in OPENCV_SUFFIXES:
+        raise UsageError(f"out must end in .xml, .yml or .yaml, got {out}")
     files = media.find_media(Path(str(cfg.input)))
     if turned := media.describe_turned(files):
         print(f"warning: {turned}", file=sys.stderr)
     predict = None if cfg.checkpoint is None else _load_network(cfg)
-    estimate_camera(files, Path(str(cfg.out)), max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
+    estimate_camera(files, out, max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
 
 
 def estimate_camera(
@@ -43,13 +49,14 @@ def estimate_camera(
     upright: bool = False,
 ) -> Camera:
     """Estimate the camera of at most so many frames of files, write it to `out`, and print how certain it is."""
+    with naming("out"):
+        out.parent.mkdir(parents=True, exist_ok=True)
     chosen = _select_frames(files, max_frames)
     count = sum(len(times) for _, times in chosen)
     frames = progress(_read_frames(chosen, upright=upright), "estimating the lens", count=count)
     with naming("input"):
         result = estimate(frames, fov_deg=fov_deg, predict=predict)
     with naming("out"):
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_opencv(out, result.camera, covariance=result.covariance)
     for message in result.warnings:
         print(f"warning: {message}", file=sys.stderr)
@@ -78,7 +85,8 @@ def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device
 
 def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
-    counts = [media.video_info(file)[0] if media.is_video(file) else 1 for file in files]
+    # A video that states no frames is read too, which says why it has none.
+    counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
     total, chosen = sum(counts), list[tuple[Path, list[int]]]()
     numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
@@ -90,6 +98,7 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
     """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
     num_read, reason = 0, ""
     for file, times in chosen:
+        num_before = num_read
         try:
             if media.is_video(file):
                 frames = (frame for _, frame in media.read_video(file, times, upright=upright))
@@ -98,11 +107,13 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             for frame in frames:
                 yield frame
                 num_read += 1
+            if times and num_read == num_before:
+                raise UnreadableImageError(f"{file} is not a video with a frame that can be decoded")
         except UnreadableImageError as error:
             reason = str(error)
             print(f"skipped: {reason}", file=sys.stderr)
     if num_read == 0:
-        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason or 'no frames'}")
+        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason}")
 
 
 def _load_network(cfg: DictConfig) -> Predictor:
@@ -110,7 +121,7 @@ def _load_network(cfg: DictConfig) -> Predictor:
     from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - lines alone need no training stack
     from torchrefract.restoration.tasks import Undistort  # noqa: PLC0415 - as above
 
-    loaded, device = load_model(str(cfg.checkpoint)), find_device(str(cfg.device))
+    loaded, device = load_model(str(cfg.checkpoint), argument="checkpoint"), find_device(str(cfg.device))
     if loaded.task != Undistort.name:
         raise UsageError(f"checkpoint must be of the task {Undistort.name}, got {cfg.checkpoint} of {loaded.task}")
     return flow_predictor(loaded.model.to(device), loaded.size, device)

@@ -47,6 +47,7 @@ from torchrefract.data.media import (
     is_video,
     output_name,
     video_info,
+    write_map,
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
@@ -56,6 +57,7 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
+    check_run_folder,
     how_to_continue,
     load_model,
     load_weights,
@@ -68,7 +70,7 @@ from torchrefract.restoration.models.coordconv import weights_license
 from torchrefract.restoration.models.lens_net import LensEncoder
 from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, write_weights
-from torchrefract.restoration.tasks import Undistort
+from torchrefract.restoration.tasks import Restored, Undistort
 
 _T = TypeVar("_T")
 _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the start of processes
@@ -77,6 +79,8 @@ _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the 
 def train(cfg: DictConfig) -> None:
     """Train the model of a configuration on its data; with `ckpt_path`, resume a stopped run."""
     data, model, trainer, checkpoint = _make_parts(cfg)
+    if checkpoint is None:
+        check_run_folder(as_path(cfg.run_dir))
     num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
@@ -147,6 +151,8 @@ def restore(cfg: DictConfig) -> None:
     files = find_media(source, deep=True)
     check_output_folder(out, source, deep=True)
     job = _make_job(cfg, source if source.is_dir() else source.parent, out)
+    if job.deviation:
+        _check_maps(files, job)
     with naming("out"):
         claim(out, _settings(cfg, job), count=0, about={})
     with locked("out", out):
@@ -277,31 +283,41 @@ class _Job(NamedTuple):
     """The options of a restoration."""
 
     restorer: Restorer
-    restore_images: Callable[[Sequence[Tensor]], list[Tensor]]  # by the restorer, or by the lens of all frames
+    restore_images: Callable[[Sequence[Tensor]], list[Restored]]  # by the restorer, or by the lens of all frames
     pools_videos: bool  # each video has one lens
     source: Path  # outputs are named by the path of a file relative to this folder
     out: Path
     batch: int
     side_by_side: bool
+    deviation: bool
     device: torch.device
 
     def target(self, file: Path) -> Path:
         return self.out / output_name(file).relative_to(self.source)
 
+    def map_target(self, file: Path) -> Path:
+        return self.target(file).with_suffix(".deviation.png")
+
     def is_done(self, file: Path) -> bool:
-        return is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
+        has_map = not self.deviation or is_complete(file, self.map_target(file))
+        return has_map and is_complete(file, self.target(file), num_columns=1 + self.side_by_side)
 
     def with_one_lens(self, files: Sequence[Path], camera: Path) -> "_Job":
         """Estimate one lens for files of one camera, write the camera, and return a job that restores by it."""
         predict = flow_predictor(self.restorer.model, self.restorer.size, self.device)
         lens = estimate_camera(files, camera, predict=predict, upright=True)
-        return self._replace(restore_images=LensRestorer(lens, interpolation=self.restorer.interpolation))
+        return self._replace(restore_images=LensRestorer(lens, interpolation=self.restorer.interpolation).restore)
 
-    def restore(self, images: Sequence[Tensor]) -> Iterator[Tensor]:
-        """Restore images (3, H, W) in [0, 1]; `side_by_side` puts the image to the left of its restoration."""
+    def restore(self, images: Sequence[Tensor]) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Restore images (3, H, W) in [0, 1]; also yield the deviation of the flow, (H, W), px, or None.
+
+        `side_by_side` puts the image to the left of its restoration.
+        """
         moved = [image.to(self.device).contiguous() for image in images]
-        for before, after in zip(moved, self.restore_images(moved), strict=True):
-            yield torch.cat([before, after], dim=2) if self.side_by_side else after
+        for before, restored in zip(moved, self.restore_images(moved), strict=True):
+            after, deviations = restored.image[0], restored.deviation
+            deviation = None if deviations is None else deviations[0].norm(dim=0)
+            yield torch.cat([before, after], dim=2) if self.side_by_side else after, deviation
 
 
 def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
@@ -309,8 +325,15 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         batch = check_count("batch", cfg.batch)
     with naming("side_by_side"):
         side_by_side = check_flag("side_by_side", cfg.side_by_side)
+    with naming("deviation"):
+        deviation = check_flag("deviation", cfg.deviation)
     device = find_device(str(cfg.device))
     loaded = load_model(str(cfg.ckpt_path), changes=cfg.model)
+    if deviation and (cfg.pool == "lens" or not loaded.model.has_deviation):
+        raise UsageError(
+            "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at "
+            f"least two samples, got true for {loaded.name}"
+        )
     with naming("size"):
         size = loaded.size if cfg.size is None else check_size("size", cfg.size)
     with naming("tile"):
@@ -327,7 +350,23 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         restorer = Restorer(loaded.model.to(device), size=size, **options)
     # Other networks of this task find warps that change from frame to frame, too.
     finds_lenses = any(isinstance(part, LensEncoder) for part in loaded.model.modules())
-    return _Job(restorer, restorer, cfg.pool == "auto" and finds_lenses, source, out, batch, side_by_side, device)
+    pools_videos = cfg.pool == "auto" and finds_lenses
+    return _Job(restorer, restorer.restore, pools_videos, source, out, batch, side_by_side, deviation, device)
+
+
+def _check_maps(files: Sequence[Path], job: _Job) -> None:
+    """Raise UsageError if a file is a video, or if the map of a picture would replace another file."""
+    owners = {job.target(file): file for file in files}
+    for file in files:
+        if is_video(file):
+            raise UsageError(f"deviation must be false for videos, got true with {file}: save its frames as files")
+        path = job.map_target(file)
+        if path in owners:
+            raise UsageError(
+                f"deviation must have a name for each map, got {owners[path]} and {file}, which both need {path}: give "
+                "the pictures names that differ in more than their extension"
+            )
+        owners[path] = file
 
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
@@ -356,12 +395,16 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, Unrea
                 images[file] = read_image(file)
             except UnreadableImageError as error:
                 _skip(file, error, failed)
-        for file, image in zip(images, job.restore([*images.values()]) if images else (), strict=True):
+        restored = job.restore([*images.values()]) if images else ()
+        for file, (image, deviation) in zip(images, restored, strict=True):
             target = job.target(file)
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 with replace_file(target, alone=True) as path:
                     write_picture(image, path, source=file)
+                if job.deviation and deviation is not None:
+                    with replace_file(job.map_target(file), alone=True) as path:
+                        write_map(deviation, path)
                 count += 1
             except UnreadableImageError as error:  # the file vanished after it was read
                 _skip(file, error, failed)
@@ -374,7 +417,7 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
         num_frames = video_info(file)[0]
         for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
-            yield from map(pixels_of, job.restore([frame[0] for frame in chunk]))
+            yield from (pixels_of(image) for image, _ in job.restore([frame[0] for frame in chunk]))
 
     target = job.target(file)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,6 @@ from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.rolling_shutter import (
     ShutterMotion,
-    nearest_exposed,
     rolling_shutter_flow,
     rolling_shutter_restore_flow,
 )
@@ -23,7 +22,6 @@ from torchrefract.fields.rolling_shutter_error import RollingShutterErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
-from torchrefract.warping.implicit import sample_at
 from torchrefract.warping.invert import residual_of
 from torchrefract.warping.lattice import pixel_lattice
 
@@ -166,13 +164,7 @@ class RollingShutter(WarpEffect):
         """Compute the flow at the depth where each point ends."""
         motion, inverse_depth = self._motion(params)
         view = pinhole_of(self.camera, height=plan.height, width=plan.width)
-        nearest = None
-        if params.is_map:
-            pixels = pixel_lattice(plan.height, plan.width).points(
-                dtype=inverse_depth.dtype, device=inverse_depth.device
-            )
-            nearest = sample_at(nearest_exposed(motion, inverse_depth, pixels, view), points)
-        return rolling_shutter_flow(motion, lambda ends: sample_at(inverse_depth, ends), points, view, nearest=nearest)
+        return rolling_shutter_flow(motion, inverse_depth, points, view)
 
     def inverse_flow(self, params: ParamsAtDepth, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute where each point of the clean frame is exposed; it exists where the flow leads back to the point."""

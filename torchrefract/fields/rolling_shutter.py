@@ -5,21 +5,22 @@ axis z of the pose at t = 0, and is turned by the angles a(t) - a(0). The clean 
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import highest_nearby
+from torchrefract._validation import eager_bool
 from torchrefract.cameras.camera import Pinhole
-from torchrefract.warping.grid import Points
+from torchrefract.warping.grid import Points, pixel_axes
+from torchrefract.warping.implicit import sample_at
 
 _SMALLEST_SCALE = 0.05  # of the distance to a point while the rows are read; below, the camera passes the point
 _OUTSIDE = 2.0  # frames off, where points without a source are sampled
 _LARGEST_SHARE = 0.9  # of a step of the time at which a point is exposed, as far as it is extrapolated
 _LARGEST_MISS_PX = 0.01
-_SAME_DEPTH = 0.8  # of the inverse depth of a surface is still that surface
+_TINY = 1e-15  # 1/m; a change of 0 is divided by it
 _LARGEST_SLOPE = 0.5  # of the fixed point of depth, as far as it is extrapolated; edges of depth are steeper
 
 
@@ -76,8 +77,8 @@ def rotation(angles: list[Tensor]) -> list[list[Tensor]]:
     ]
 
 
-def nearest_exposed(motion: ShutterMotion, inverse_depth: Tensor, points: Points, pinhole: Pinhole) -> Tensor:
-    """Return about which 1/Z each pixel of the rolling frame shows, (N, 1, H, W), and 0 where none is known.
+def nearest_exposed(motion: ShutterMotion, inverse_depth: Tensor, pinhole: Pinhole) -> Tensor:
+    """Return about which 1/Z each pixel shows if the camera does not turn, (N, 1, H, W), and 0 where none is known.
 
     Each pixel of the clean frame is moved to the pixel that shows it, and the nearest one counts, also for the pixels
     around. It finds thin objects that move farther than they are wide. Without gradient.
@@ -85,52 +86,44 @@ def nearest_exposed(motion: ShutterMotion, inverse_depth: Tensor, points: Points
     Args:
         motion, pinhole: as for `rolling_shutter_flow`.
         inverse_depth: (N, 1, H, W), 1/m, of the clean frame.
-        points: its pixels.
     """
-    height, width = points.lattice.height, points.lattice.width
-    (fx, fy), (cx, cy) = pinhole
+    height, width = inverse_depth.shape[2:]
     with torch.no_grad():
-        inverse_depth = inverse_depth.detach()
+        inverse_depth, (cx, cy) = inverse_depth.detach(), pinhole[1]
         motion = ShutterMotion(*(value.detach() for value in motion))
-        x, y, speed = (points.x - cx) / fx, (points.y - cy) / fy, motion.speed.view(-1, 1, 1, 1)
-        time = row_time(motion, points.y, height=height)
-        (a, b, c), (d, e, f), (g, h, i) = rotation(turn(motion, time))
-        column = row = points.y
-        for _ in range(2):
-            z = 1 - speed * time * inverse_depth
-            depth = (c * x + f * y + i * z).clamp(min=_SMALLEST_SCALE)
-            column, row = cx + fx * ((a * x + d * y + g * z) / depth), cy + fy * ((b * x + e * y + h * z) / depth)
-            time = row_time(motion, row.clamp(-height, 2 * height), height=height)
-        column, row = column.round(), row.round()
-        is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        index = torch.where(is_inside, row * width + column, float(height * width)).long().flatten(1)
-        nearest = inverse_depth.new_zeros(len(index), height * width + 1)
-        nearest = nearest.scatter_reduce(1, index, inverse_depth.flatten(1), "amax")[:, :-1]
-        return highest_nearby(nearest.view(-1, 1, height, width))
+        x, y = pixel_axes(height, width, dtype=inverse_depth.dtype, device=inverse_depth.device)
+
+        def scale_at(row: Tensor) -> Tensor:
+            way = motion.speed.view(-1, 1, 1, 1) * row_time(motion, row, height=height)
+            return (1 - way * inverse_depth).clamp(min=_SMALLEST_SCALE)
+
+        scale = scale_at((y - cy) / scale_at(y) + cy)
+        # A border of one pixel around the frame collects what leaves it. NaN too has an integer, which can be clamped.
+        row, column = (
+            ((position - center) / scale + (center + 1.5)).int().clamp(0, size + 1)
+            for position, center, size in ((y, cy, height), (x, cx, width))
+        )
+        index = (row * (width + 2) + column).long().flatten(1)
+        nearest = inverse_depth.new_zeros(len(index), (height + 2) * (width + 2))
+        nearest = nearest.scatter_reduce(1, index, inverse_depth.expand(len(index), -1, -1, -1).flatten(1), "amax")
+        return highest_nearby(nearest.view(-1, 1, height + 2, width + 2)[:, :, 1:-1, 1:-1])
 
 
 def rolling_shutter_flow(
-    motion: ShutterMotion,
-    inverse_depth: Callable[[Points], Tensor],
-    points: Points,
-    pinhole: Pinhole,
-    *,
-    nearest: Tensor | None = None,
+    motion: ShutterMotion, inverse_depth: Tensor, points: Points, pinhole: Pinhole
 ) -> tuple[Tensor, Tensor]:
     """Compute the backward flow of a rolling shutter.
 
         p + flow(p) = c + f (r_x, r_y) / r_z (1 - v t / Z),  r = R(t) ((x - cx) / fx, (y - cy) / fy, 1),  t = t(y)
 
-    Z is the depth where the point ends, at p + flow(p). It is found by a fixed-point step from the depth at the point
-    without forward motion, and extrapolated by its slope: exact for planes. An object in front of that counts where
-    `nearest` leads to it.
+    Z is the depth where the point ends, at p + flow(p). It is found by two fixed-point steps, extrapolated by the slope
+    between them: exact for planes. They start at the nearest depth that a map moves to the point, or at infinity.
 
     Args:
         motion: of N cameras.
-        inverse_depth: returns 1/Z, (N, 1, h, w), 1/m, at points of the clean frame.
+        inverse_depth: (N, 1, H, W or 1), 1/m, of the clean frame.
         points: where the flow is computed, px.
         pinhole: of the camera.
-        nearest: (N, 1, h, w), 1/m, at the points, from `nearest_exposed`.
 
     Returns:
         flow: (N, 2, h, w), px.
@@ -144,28 +137,37 @@ def rolling_shutter_flow(
     (fx, fy), (cx, cy) = pinhole
     time = row_time(motion, points.y, height=height)
     x, y = (points.x - cx) / fx, (points.y - cy) / fy
-    rx, ry, rz = (a * x + (b * y + c) for a, b, c in rotation(turn(motion, time)))
+    # A row at a time: of undisplaced points only the products with x are computed at each of them.
+    rx, ry, rz = (
+        f * a * x + f * (b * y + c) for f, (a, b, c) in zip((fx, fy, 1.0), rotation(turn(motion, time)), strict=True)
+    )
     along, is_ahead = motion.speed.view(-1, 1, 1, 1) * time, rz > _SMALLEST_SCALE
     rz = rz.clamp(min=_SMALLEST_SCALE)
     # The point without forward motion, seen from the principal point, px.
-    turned_x, turned_y = fx * (rx / rz), fy * (ry / rz)
+    turned_x, turned_y = rx / rz, ry / rz
 
-    def at(scale: Tensor) -> Points:
+    def at(scale: Tensor | float) -> Points:
         return points._replace(x=cx + turned_x * scale, y=cy + turned_y * scale, is_displaced=True)
 
-    first = inverse_depth(at(torch.ones_like(rz)))
-    second = inverse_depth(at((1 - along * first).clamp(min=_SMALLEST_SCALE)))
-    slope = (second - first) / first.clamp(min=1e-12)
-    w = torch.where(slope.abs() <= _LARGEST_SLOPE, first / (1 - slope), second)
-    if nearest is not None:
-        front = inverse_depth(at((1 - along * nearest).clamp(min=_SMALLEST_SCALE)))
-        is_front = (front >= _SAME_DEPTH * nearest) & (_SAME_DEPTH * front > w)
-        w = torch.where(is_front, front, w)
-    scale = 1 - along * w
+    def step(inverse: Tensor) -> Tensor:
+        return sample_at(inverse_depth, at((1 - along * inverse).clamp(min=_SMALLEST_SCALE)))
+
+    start = torch.zeros_like(along)
+    if inverse_depth.shape[3] > 1:
+        start = sample_at(nearest_exposed(motion, inverse_depth, pinhole), at(1.0))
+    first = step(start)
+    second = step(first)
+    before, after = first - start, second - first
+    extrapolated = second + after * after / (before - after + _TINY)
+    # Across an edge of depth the nearest counts.
+    is_flat = after.abs() < _LARGEST_SLOPE * before.abs()
+    scale = 1 - along * torch.where(is_flat, extrapolated, torch.maximum(first, second))
     exists = is_ahead & (scale > _SMALLEST_SCALE)
     end = at(scale)
     flow = torch.cat(torch.broadcast_tensors(end.x - points.x, end.y - points.y), dim=1)
-    return torch.where(exists, flow, _OUTSIDE * max(height, width)), exists
+    if eager_bool(exists.all, of=exists) is not True:
+        flow = torch.where(exists, flow, _OUTSIDE * max(height, width))
+    return flow, exists
 
 
 def rolling_shutter_restore_flow(

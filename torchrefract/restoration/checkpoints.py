@@ -119,6 +119,15 @@ def how_to_continue(path: Path) -> str:
     return f"ckpt_path={path} continues" if path.is_file() else "no epoch was completed, so nothing is saved"
 
 
+def check_run_folder(run: Path) -> None:
+    """Raise CheckpointError if a new training would replace the checkpoints of another one in its run folder."""
+    if (last := run / "last.ckpt").is_file():
+        raise CheckpointError(
+            f"run_dir must be a folder without the checkpoints of another training, got {run}: {how_to_continue(last)} "
+            "that one, and another run_dir keeps it"
+        )
+
+
 def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
     """Return the number of complete epochs of a training checkpoint.
 
@@ -142,7 +151,7 @@ class Loaded(NamedTuple):
     licenses: dict[str, Any]  # by source of the model, the license, or None if it is unknown
 
 
-def load_model(path: str | Path, *, changes: Mapping[str, Any] | None = None) -> Loaded:
+def load_model(path: str | Path, *, changes: Mapping[str, Any] | None = None, argument: str = "ckpt_path") -> Loaded:
     """Build the model of a checkpoint from the configuration inside the checkpoint.
 
     Only networks, models and tasks of torchrefract are instantiated. Pretrained weights are not loaded, because the
@@ -151,19 +160,20 @@ def load_model(path: str | Path, *, changes: Mapping[str, Any] | None = None) ->
     Args:
         path: the checkpoint, or the name of a model that comes with torchrefract, see `pretrained`.
         changes: values that replace those of the model's configuration.
+        argument: the option that gave the path, for messages.
 
     Raises:
         CheckpointError: see `read_checkpoint` and `check_fits`; the configuration is missing or of something else.
     """
     path = find_checkpoint(path)
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, argument=argument)
     config, data = (checkpoint.get(part) for part in ("config", "data"))
     if not (isinstance(config, dict) and isinstance(config.get("model"), dict) and isinstance(data, dict)):
         raise CheckpointError(
-            f"ckpt_path must be a checkpoint with its configuration, as torchrefract.train writes them, got {path}"
+            f"{argument} must be a checkpoint with its configuration, as torchrefract.train writes them, got {path}"
         )
     model = _instantiate(config["model"], changes or {}, path)
-    check_fits(checkpoint, model, path, config=config["model"])
+    check_fits(checkpoint, model, path, config=config["model"], argument=argument)
     model.on_load_checkpoint(checkpoint)
     model.load_state_dict(checkpoint["state_dict"])
     licenses = checkpoint.get("licenses", {})

@@ -9,7 +9,7 @@ from diffusers import DDPMScheduler
 from torch import Tensor, nn
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_count
+from torchrefract._validation import UsageError, check_count
 from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
 from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
@@ -93,11 +93,16 @@ class FlowDiffusion(AveragedRestoration):
         self.register_buffer("center", torch.zeros(num_coefficients))
         self.register_buffer("components", torch.zeros(components, num_coefficients))
 
+    @property
+    def has_deviation(self) -> bool:
+        """Return True for at least two samples."""
+        return self.samples > 1
+
     @torch.no_grad()
     def forward(self, degraded: Tensor, key: Tensor | None = None) -> Restored:
         """Restore images (B, 3, H, W) in [0, 1] by the mean of the samples, with the deviation of the flow, px.
 
-        The deviation is 0 for one sample. The key is that of `RestorationModule.forward`.
+        One sample has no deviation. The key is that of `RestorationModule.forward`.
         """
         key = torch.zeros(len(degraded), dtype=torch.int64) if key is None else key
         numbers = self._sample(cast(Any, self.network).encode(degraded), self._stream(key, 0))
@@ -109,13 +114,19 @@ class FlowDiffusion(AveragedRestoration):
             maps = _sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
             center, maps = maps[0], maps[1:]
             flow = center + torch.einsum("bk,kchw->bchw", mean, maps)
-            covariance = rest.mT @ rest / max(1, self.samples - 1)
+            restored = Restored(warp(degraded, flow, padding="border")[0], flow)
+            if not self.has_deviation:
+                return restored
+            covariance = rest.mT @ rest / (self.samples - 1)
             variance = (torch.einsum("bkl,lchw->bkchw", covariance, maps) * maps).sum(dim=1)
-        deviation = variance.clamp(min=0).sqrt()
-        return Restored(warp(degraded, flow, padding="border")[0], flow, deviation=deviation)
+        return restored._replace(deviation=variance.clamp(min=0).sqrt())
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at random levels for each sample; each step has its own draws."""
+        """Compute the loss at random levels for each sample; each step has its own draws.
+
+        Raises:
+            UsageError: the first batch has no more lenses than there are components.
+        """
         if not self.components.any():
             self._find_components(batch)
         return self._loss(batch, 1 + self.global_step), None
@@ -158,6 +169,12 @@ class FlowDiffusion(AveragedRestoration):
 
     def _find_components(self, batch: Pair) -> None:
         """Find the mean and the principal components of the coefficients of a batch, over all ranks."""
+        num_lenses, num_components = len(batch.flow) * self.trainer.world_size, len(self.components)
+        if num_lenses <= num_components:
+            raise UsageError(
+                f"data.batch_size must be above model.components={num_components}, which are those of the lenses of "
+                f"the first batch, got {num_lenses}: raise it, or lower model.components"
+            )
         coefficients = fit_polynomial(batch).double()  # autocast leaves doubles as they are
         reduce = self.trainer.strategy.reduce
         mean = reduce(coefficients.mean(dim=0), reduce_op="mean")

@@ -26,7 +26,7 @@ class Restorer:
     The model sees each picture resized to `size`. If it predicts a flow, the flow is resized to the picture, which is
     warped once. Otherwise its change is brought to the picture by `transfer_change`. With `tile` the model sees tiles
     of the picture at its own size instead, see `restore_tiles`. If the model predicts the standard deviation of the
-    flow, its root mean square over each picture, px, is added to the list `deviations`.
+    flow, `restore` returns its map, and its root mean square over each picture, px, is added to the list `deviations`.
 
     Args:
         model: maps images (B, 3, H, W) in [0, 1] to `Restored`.
@@ -55,24 +55,31 @@ class Restorer:
         self.batch = check_count("batch", batch)
         self.deviations: list[float] = []  # px, of each picture
 
-    @torch.inference_mode()
     def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
         """Restore pictures (3, H, W) in [0, 1], which may differ in size."""
+        return [restored.image[0] for restored in self.restore(images)]
+
+    @torch.inference_mode()
+    def restore(self, images: Sequence[Tensor]) -> list[Restored]:
+        """Restore pictures (3, H, W) as batches of one, with the flow and its deviation if the model predicts them."""
         if self.tile is not None:
             tiled = [restore_tiles(self._restore_tile, image, tile=self.tile, batch=self.batch) for image in images]
-            return [image.clamp(0, 1) for image in tiled]
+            return [Restored(image[None].clamp(0, 1)) for image in tiled]
         small = torch.cat([resize_image(image[None], self.size) for image in images])
         restored = self.model(small)
         flows = [None] * len(images) if restored.flow is None else restored.flow.split(1)
         parts = zip(images, small.split(1), map(Restored, restored.image.split(1), flows), strict=True)
-        if restored.deviation is not None:
-            for image, deviation in zip(images, restored.deviation, strict=True):
-                full = resize_flow(deviation[None], image.shape[1:])
-                self.deviations.append(full.square().sum(dim=1).mean().sqrt().item())
-        return [
-            at_full_size(one, image[None], small=before, interpolation=self.interpolation).image[0]
+        results = [
+            at_full_size(one, image[None], small=before, interpolation=self.interpolation)
             for image, before, one in parts
         ]
+        if restored.deviation is None:
+            return results
+        maps = [
+            resize_flow(one, image.shape[1:]) for image, one in zip(images, restored.deviation.split(1), strict=True)
+        ]
+        self.deviations += [one.square().sum(dim=1).mean().sqrt().item() for one in maps]
+        return [result._replace(deviation=one) for result, one in zip(results, maps, strict=True)]
 
     def _restore_tile(self, tiles: Tensor) -> Tensor:
         restored = self.model(tiles)
@@ -96,12 +103,17 @@ class LensRestorer:
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
         self._flow = lru_cache(maxsize=2)(self._compute_flow)
 
-    @torch.inference_mode()
     def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
         """Restore pictures (3, H, W) in [0, 1]."""
+        return [restored.image[0] for restored in self.restore(images)]
+
+    @torch.inference_mode()
+    def restore(self, images: Sequence[Tensor]) -> list[Restored]:
+        """Restore pictures (3, H, W) as batches of one, with the flow."""
         flows = [self._flow(*image.shape[1:]).to(image.device, image.dtype) for image in images]
         options = {"padding": "border", "interpolation": self.interpolation}
-        return [warp(image[None], flow, **options)[0][0].clamp(0, 1) for image, flow in zip(images, flows, strict=True)]
+        pairs = zip(images, flows, strict=True)
+        return [Restored(warp(image[None], flow, **options)[0].clamp(0, 1), flow) for image, flow in pairs]
 
     def _compute_flow(self, height: int, width: int) -> Tensor:
         return camera_flow(self.camera.resized(width=width, height=height))[0]

@@ -79,6 +79,11 @@ class RestorationModule(LightningModule, ABC):
             key: (B,), int64, the keys of the random numbers that a network draws; None stands for zeros.
         """
 
+    @property
+    def has_deviation(self) -> bool:
+        """Return True if restorations have the standard deviation of their flow."""
+        return False
+
     @abstractmethod
     def training_loss(self, batch: Pair) -> tuple[Tensor, Restored | None]:
         """Compute the loss () of a training batch; also return the restoration if the loss needs it."""

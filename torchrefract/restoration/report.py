@@ -23,10 +23,11 @@ from torchrefract.data.frames import FrameFolder
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
+from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.restoration.metrics import psnr
 from torchrefract.restoration.models.lens_net import LensNet
 from torchrefract.restoration.module import RestorationModule
-from torchrefract.restoration.tasks import Restored
+from torchrefract.restoration.tasks import Deweather, Restored
 from torchrefract.types import Pair
 from torchrefract.visualization.color import flow_to_rgb, full_color_px, hatch_invalid
 from torchrefract.visualization.figures import MapScale, draw_invalid_key, draw_legend
@@ -64,8 +65,8 @@ class RunSummary(Callback):
         if isinstance(pl_module, RestorationModule):
             print("\n".join(describe_training(trainer, pl_module)), flush=True)
             data = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
-            has_lenses = _draws_lenses(data.effect) and isinstance(data.train, FrameFolder)
-            if has_lenses and (shifts := bent_drives(data.train)):
+            has_lenses = data.effect is not None and _has_part(data.effect, LensDistortion)
+            if has_lenses and isinstance(data.train, FrameFolder) and (shifts := bent_drives(data.train)):
                 print(describe_bent(shifts), flush=True)
 
     def on_validation_batch_end(
@@ -132,13 +133,15 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
     }
     if isinstance(model.network, LensNet) and not isinstance(data.effect, LensDistortion | None):
         lines["scene"] += "; lens_net predicts the flow of a lens alone: add model=resunet for other warps"
+    if isinstance(model.task, Deweather) and data.effect is not None and _has_part(data.effect, WarpEffect):
+        lines["scene"] += "; it moves pixels too, which deweather does not undo: that takes +task=undistort"
     if model.schedule == "cosine" and (num := model.num_warmup_steps(int(steps))) < model.warmup_steps:
         lines["steps"] += f"; warm-up {num}, a tenth, instead of warmup_steps={model.warmup_steps}"
     return [f"{name:<12}{text}" for name, text in lines.items()]
 
 
-def _draws_lenses(effect: Effect | None) -> bool:
-    return effect is not None and any(isinstance(part, LensDistortion) for part in effect.modules())
+def _has_part(effect: Effect, kind: type[Effect]) -> bool:
+    return any(isinstance(part, kind) for part in effect.modules())
 
 
 def describe_bent(shifts: Mapping[str, float]) -> str:

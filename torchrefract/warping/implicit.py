@@ -205,8 +205,8 @@ def _sample_rows(values: Tensor, y: Tensor) -> Tensor:
     batch, channels, height, _ = values.shape
     if height == 1:
         return values + torch.zeros_like(y)
-    row = y.detach().floor().clamp(0, height - 2)
-    index = row.long().expand(batch, channels, -1, -1).flatten(2)
+    row = y.detach().clamp(0, height - 2).long()
+    index = row.expand(batch, channels, -1, -1).flatten(2)
     rows = values[..., 0]
     low, step = (table.gather(2, index).view(batch, channels, *y.shape[2:]) for table in (rows[:, :, :-1], rows.diff()))
     return torch.addcmul(low, step, y - row)

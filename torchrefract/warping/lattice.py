@@ -6,9 +6,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchrefract._tensor import cat_bands, rows_at_once
 from torchrefract._validation import eager_values
 from torchrefract.ops.sampling import interpolate_nodes, lagrange_basis
 from torchrefract.warping.grid import Points
+
+_CACHED_POINTS = 1 << 15  # where a flow is interpolated at once
+_MARGIN = 8  # nodes around points, of which there are multiples
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,10 @@ class LatticeFlow:
             return self.nodes
         rows, columns = self.nodes.shape[2:]
         x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
-        return _cubic(self.nodes, x, y)
+        count, each = torch.broadcast_shapes(x.shape, y.shape)[2:]
+        band = rows_at_once(x.device, count, each=each, cached=_CACHED_POINTS)
+        bands = ([at if at.shape[2] == 1 else at[:, :, i : i + band] for at in (x, y)] for i in range(0, count, band))
+        return cat_bands((_cubic(self.nodes, x, y) for x, y in bands), dim=2, length=count)
 
 
 def within_reach(points: Points) -> Points:
@@ -122,7 +129,8 @@ def lattice_around(points: Points, stride: int) -> Lattice:
     left, right, top, bottom = ends or (0.0, width + longest / 4, 0.0, 0.0)
     outside = max(-left, right - width, -top, bottom - height, 0.0)
     reach = outside if outside < longest else longest  # also if it is NaN
-    return Lattice(height, width, stride, margin=2 + math.ceil(reach / stride))
+    # The severities of a scene, whose reach differs by a few pixels, share their fields.
+    return Lattice(height, width, stride, margin=_MARGIN * math.ceil((2 + reach / stride) / _MARGIN))
 
 
 def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
@@ -132,7 +140,7 @@ def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
 
 def _cell(index: Tensor, count: int) -> Tensor:
     """Return the second of the four nodes around each fractional index, int64."""
-    return index.detach().floor().clamp(1, count - 3).long()
+    return index.detach().clamp(1, count - 3).long()
 
 
 def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:

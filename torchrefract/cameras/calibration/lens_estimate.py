@@ -65,9 +65,7 @@ def estimate_lens(
     Raises:
         ValueError: there are no frames, they differ in size, or `fov_deg` is not in [1, 170].
     """
-    focal = UNKNOWN_FOCAL  # widths
-    if fov_deg is not None:
-        focal = 0.5 / math.tan(math.radians(check_number("fov_deg", fov_deg, low=1.0, high=170.0) / 2))
+    focal = focal_of_view(fov_deg)
     size, chains, lenses = None, list[Tensor](), list[Tensor]()
     for i, frame in enumerate(frames):
         image = _check_frame(frame, i, size)
@@ -80,6 +78,17 @@ def estimate_lens(
     pooled = pool_chains(chains, size)
     prior = pool_lenses(torch.stack(lenses)) if lenses else published_prior()
     return _to_estimate(pooled, prior, len(chains), focal * size[1])
+
+
+def focal_of_view(fov_deg: float | None) -> float:
+    """Return the focal length, in widths of the frame, of a horizontal field of view; None is an unknown one.
+
+    Raises:
+        ValueError: `fov_deg` is not in [1, 170].
+    """
+    if fov_deg is None:
+        return UNKNOWN_FOCAL
+    return 0.5 / math.tan(math.radians(check_number("fov_deg", fov_deg, low=1.0, high=170.0) / 2))
 
 
 def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:

@@ -44,6 +44,10 @@ _SUN: dict[str, Any] = {
     **{"luminance_range": (9.0, 20.0), "ghost_share_range": (0.01, 0.02), "ghost_radius_range": (9.0, 20.0)},
 }
 FOG: dict[str, Any] = {"visibility_range": (20.0, 60.0), "airlight": (0.9, 0.7, 0.8), "tolerance": None}
+NOISE: dict[str, Any] = {
+    "scales": (8.0, 32.0),
+    "weights": (0.6, 0.4),
+}  # each octave more takes as long, by the same code
 WARPS: dict[str, Callable[..., Effect]] = {
     "lens": partial(tr.LensDistortion, k1_range=(-0.3, -0.2), **_SMALL_TERMS),
     "turbulence": partial(tr.Turbulence, amplitude_range=(0.3, 0.5), length_range=(3.0, 4.0)),
@@ -59,8 +63,8 @@ WARPS: dict[str, Callable[..., Effect]] = {
 }
 PHOTOMETRIC: dict[str, Callable[[], Effect]] = {
     "uniform fog": lambda: tr.UniformFog(**FOG),
-    "heterogeneous fog": lambda: tr.HeterogeneousFog(**FOG),
-    "volumetric fog": lambda: tr.HeterogeneousFog(mode="ray", **FOG),
+    "heterogeneous fog": lambda: tr.HeterogeneousFog(**FOG, **NOISE),
+    "volumetric fog": lambda: tr.HeterogeneousFog(mode="ray", **FOG, **NOISE),
     "flare": lambda: tr.LensFlare(drift_y_range=(-0.01, 0.01), strength_range=(0.2, 0.5), tolerance=None),
     "sun glare": lambda: tr.SunGlare(**_SUN),
     "exposure": lambda: tr.Exposure(shot_range=(0.001, 0.01), read_range=(0.001, 0.01), time_constant_range=(1.0, 2.0)),

@@ -246,13 +246,12 @@ def test_invalid_options_are_one_line_of_error(call, options, message):
     assert re.search(message, call("calibrate", *options).message)
 
 
-@pytest.mark.parametrize(("name", "marker_mm"), [("caliscope_cam0", 40.5), ("caliscope_cam1", 40.5)])
-def test_edge_rays_of_real_pictures_are_near_the_published_camera(name, marker_mm, call, shared_data, tmp_path):
-    board = ("squares=4x5", "square_mm=54", f"marker_mm={marker_mm}", "dictionary=DICT_4X4_1000")
-    folder = shared_data / "charuco" / name
+def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_data, tmp_path):
+    board = ("squares=4x5", "square_mm=54", "marker_mm=40.5", "dictionary=DICT_4X4_1000")
+    folder = shared_data / "charuco" / "caliscope_cam0"
     assert call("calibrate", f"images={folder}", *board, "out=out").code == 0
     camera = read_opencv(tmp_path / "out" / "camera.yaml")
-    numbers = json.loads((folder.parent / "reference.json").read_text())[name]["published"]
+    numbers = json.loads((folder.parent / "reference.json").read_text())[folder.name]["published"]
     pinhole = {key: numbers[key] for key in ("fx", "fy", "cx", "cy")}
     published = Camera(width=1280, height=720, **pinhole, coefficients=tuple(numbers["dist_k1k2p1p2k3"]))
     grid = published.grid(17)

@@ -212,7 +212,6 @@ def test_one_graph_draws_the_same_seeds_words_and_noise_as_eager_code():
             key,
             random.uniform(random.fold(source), 7),
             random.lattice_noise(key, axes, 2),
-            random.normal(source, 7),
             random.white_noise(key, 1_021),
         )
 
@@ -221,8 +220,7 @@ def test_one_graph_draws_the_same_seeds_words_and_noise_as_eager_code():
     torch.manual_seed(11)
     drawn = torch.compile(draw, fullgraph=True)(keys)
     assert all(map(torch.equal, drawn[:4], expected[:4]))
-    for value, other in zip(drawn[4:], expected[4:], strict=True):  # the compiler has other logarithms and cosines
-        torch.testing.assert_close(value, other, atol=2e-6, rtol=1e-6)
+    torch.testing.assert_close(drawn[4], expected[4], atol=2e-6, rtol=1e-6)  # which has other logarithms and cosines
 
 
 @pytest.mark.quick

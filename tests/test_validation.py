@@ -1,6 +1,8 @@
 import math
 import re
 import warnings
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,14 @@ def positive(value):
     return value > 0
 
 
+def check_zero_flow(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> None:
+    check_flow("flow", torch.zeros(shape, dtype=dtype))
+
+
+in_unit = partial(check_number, "p", low=0.0, high=1.0)
+unit_range = partial(check_range, "r", low=0.0, high=1.0)
+
+
 @pytest.mark.quick
 def test_check_number_returns_a_float():
     value = check_number("p", 1, low=0.0, high=1.0)
@@ -36,18 +46,41 @@ def test_check_number_returns_a_float():
     assert check_number("shift", -1e300) == -1e300
 
 
-@pytest.mark.parametrize(
-    ("value", "rule"),
-    [
-        (-0.1, r"p must be a number in \[0, 1\], got -0\.1"),
-        (1.5, r"p must be a number in \[0, 1\], got 1\.5"),
-        (math.inf, r"p must be a number in \[0, 1\], got inf"),
-        (math.nan, "p must not be NaN"),
-    ],
-)
-def test_numbers_outside_of_the_bounds_raise(value, rule):
-    with pytest.raises(ValueError, match=rule):
-        check_number("p", value, low=0.0, high=1.0)
+REFUSED: list[tuple[Callable[[Any], Any], tuple[Any, ...], type[Exception], str]] = [  # check, values, error, rule
+    (in_unit, (-0.1,), ValueError, r"p must be a number in \[0, 1\], got -0\.1"),
+    (in_unit, (1.5,), ValueError, r"p must be a number in \[0, 1\], got 1\.5"),
+    (in_unit, (math.inf,), ValueError, r"p must be a number in \[0, 1\], got inf"),
+    (in_unit, (math.nan,), ValueError, "p must not be NaN"),
+    (in_unit, ("1", None, True, np.True_, [1.0], 1j), TypeError, "p must be a real number, got"),
+    (in_unit, (torch.tensor(1.0), np.array([1.0])), TypeError, "p must be a real number, got"),
+    (unit_range, ((2.0, 1.0), (-1.0, 0.5), (0.5, 1.5), (math.nan, 1.0), (0.0, math.nan)), ValueError, "r must"),
+    (unit_range, (1.0, (1.0,), (1.0, 2.0, 3.0), "12", None, {1.0, 2.0}), ValueError, r"r must be \(low, high\), got"),
+    (unit_range, (("0", "1"), (None, 1.0), (False, True)), TypeError, "r must be a real number"),
+    (partial(check_count, "steps"), (0,), ValueError, "steps must be at least 1, got 0"),
+    (partial(check_count, "steps"), (1.0, "1", True, None), TypeError, "steps must be a whole number, got"),
+    (partial(check_tensor, "image"), ([1.0],), TypeError, "image must be a tensor, got list"),
+    (check_zero_flow, ((2, 3, 4), (1, 3, 4, 5), (2,), (1, 1, 2, 4, 5)), ValueError, r"have shape \(B, 2, H, W\), got"),
+    (
+        partial(check_zero_flow, (1, 2, 3, 4)),
+        (torch.int64, torch.uint8, torch.bool, torch.complex64),
+        TypeError,
+        "of a floating type, got",
+    ),
+]
+
+
+@pytest.mark.parametrize(("check", "values", "error", "rule"), REFUSED)
+def test_a_value_out_of_bounds_or_of_another_kind_raises(check, values, error, rule):
+    for value in values:
+        with pytest.raises(error, match=rule):
+            check(value)
+
+
+def test_counts_and_choices_are_returned():
+    assert (check_count("steps", 1), check_count("steps", 0, low=0)) == (1, 0)
+    assert check_choice("padding", "zeros", ("zeros", "border")) == "zeros"
+    with pytest.raises(ValueError, match="padding must be one of zeros, border, got 'wrap'"):
+        check_choice("padding", "wrap", ("zeros", "border"))
 
 
 def test_check_within_allows_rounding_and_names_the_wrong_value():
@@ -68,12 +101,6 @@ def test_numpy_numbers_are_accepted():
         check_count("steps", broken)
 
 
-@pytest.mark.parametrize("value", ["1", None, True, np.True_, [1.0], 1j, torch.tensor(1.0), np.array([1.0])])
-def test_values_that_are_not_real_numbers_raise(value):
-    with pytest.raises(TypeError, match="p must be a real number, got"):
-        check_number("p", value)
-
-
 @pytest.mark.parametrize("value", [(1, 2), [1, 2], (1.0, 1.0)])
 def test_check_range_returns_two_floats(value):
     result = check_range("k1_range", value)
@@ -85,60 +112,6 @@ def test_infinite_ends_need_an_infinite_bound():
     assert check_range("visibility_range", (1.0, math.inf), low=0.0, high=math.inf) == (1.0, math.inf)
     with pytest.raises(ValueError, match="visibility_range must be"):
         check_range("visibility_range", (math.inf, math.inf), low=0.0, high=100.0)
-
-
-@pytest.mark.parametrize("value", [(2.0, 1.0), (-1.0, 0.5), (0.5, 1.5), (math.nan, 1.0), (0.0, math.nan)])
-def test_ranges_out_of_order_or_bounds_raise(value):
-    with pytest.raises(ValueError, match="beta_range must"):
-        check_range("beta_range", value, low=0.0, high=1.0)
-
-
-@pytest.mark.parametrize("value", [1.0, (1.0,), (1.0, 2.0, 3.0), "12", None, {1.0, 2.0}])
-def test_ranges_without_two_ends_raise(value):
-    with pytest.raises(ValueError, match=r"beta_range must be \(low, high\), got"):
-        check_range("beta_range", value)
-
-
-@pytest.mark.parametrize("value", [("0", "1"), (None, 1.0), (False, True)])
-def test_ranges_of_other_types_raise(value):
-    with pytest.raises(TypeError, match="beta_range must be a real number"):
-        check_range("beta_range", value)
-
-
-def test_check_choice_lists_the_choices():
-    assert check_choice("padding", "zeros", ("zeros", "border")) == "zeros"
-    with pytest.raises(ValueError, match="padding must be one of zeros, border, got 'wrap'"):
-        check_choice("padding", "wrap", ("zeros", "border"))
-
-
-def test_check_count_names_the_lowest_value():
-    assert check_count("steps", 1) == 1
-    assert check_count("steps", 0, low=0) == 0
-    with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
-        check_count("steps", 0)
-
-
-@pytest.mark.parametrize("value", [1.0, "1", True, None])
-def test_counts_that_are_not_whole_numbers_raise(value):
-    with pytest.raises(TypeError, match="steps must be a whole number, got"):
-        check_count("steps", value)
-
-
-def test_values_that_are_not_tensors_raise():
-    with pytest.raises(TypeError, match="image must be a tensor, got list"):
-        check_tensor("image", [1.0])  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize("shape", [(2, 3, 4), (1, 3, 4, 5), (2,), (1, 1, 2, 4, 5)])
-def test_flows_of_another_shape_raise(shape):
-    with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\), got"):
-        check_flow("flow", torch.zeros(shape))
-
-
-@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.bool, torch.complex64])
-def test_flows_of_another_type_raise(dtype):
-    with pytest.raises(TypeError, match="flow must be of a floating type, got"):
-        check_flow("flow", torch.zeros(1, 2, 3, 4, dtype=dtype))
 
 
 def test_check_values_names_the_first_wrong_value():

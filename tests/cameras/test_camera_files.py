@@ -253,13 +253,13 @@ ROI = message(FIVE, "plumb_bob").replace("x_offset: 0", "x_offset: 8")
 HALF = message(FIVE, "plumb_bob").replace("height: 0", "height: 240")
 TWO = message(FIVE, "plumb_bob") + message(EIGHT, "rational_polynomial")
 ZERO_K = message((), "plumb_bob").replace("510.25", "0.0")
+BINNED = message(FIVE, "plumb_bob").replace("binning_x: 0", "binning_x: 2")
+SHARES = storage(FIVE).replace("510.25, 0., 322.5, 0., 505.75, 237.125", "0.8, 0., 0.5, 0., 1.05, 0.5")
+TWICE = "must hold K once, got .* with it twice; keep one of them"
+kalibr_with = ONE_CAMERA.replace
 # Content, arguments, message.
 REFUSED = {
-    "another model": (
-        message(FISHEYE, "equidistant"),
-        {"model": "opencv"},
-        "model must be fisheye as .* states, got o",
-    ),
+    "another model": (message(FISHEYE, "equidistant"), {"model": "opencv"}, "be fisheye as .* states, got opencv"),
     "no size": (storage(FIVE, ""), {}, "must hold image_width, got .*; add it, or state width in read_camera"),
     "another size": (storage(FIVE), {"width": 320}, "width must be 640 as .* states, got 320; use camera.resized"),
     "an option of others": (storage(FIVE), {"focal_mm": 3}, "focal_mm must be None for a file of OpenCV or ROS, got 3"),
@@ -268,27 +268,11 @@ REFUSED = {
     "messages that differ": (TWO, {}, "must hold one camera, got .* of 2 different ones; keep those of one"),
     "a part of the frame": (ROI, {}, "whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
     "the upper half": (HALF, {}, "must describe whole frames, got .* the roi .*; remove roi, and use camera.cropped"),
-    "binned frames": (
-        message(FIVE, "plumb_bob").replace("binning_x: 0", "binning_x: 2"),
-        {},
-        r"must describe whole frames, got .* with binning_x and binning_y of \[2, 0\]; remove them, and use camera.res",
-    ),
+    "binned frames": (BINNED, {}, r"got .* with binning_x and binning_y of \[2, 0\]; remove them, and use camera.res"),
     "a matrix twice": (storage(FIVE) + "camera_matrix: [1]\n", {}, "must hold camera_matrix once, got .* twice; keep"),
-    "a matrix twice, JSON": (
-        '{"image_width": 640, "K": [1], "K": [2]}',
-        {},
-        "must hold K once, got .* with it twice; keep one of them",
-    ),
-    "a matrix twice, XML": (
-        "<opencv_storage><K>1</K><K>2</K></opencv_storage>",
-        {},
-        "must hold K once, got .* with it twice; keep one of them",
-    ),
-    "shares of the frame": (
-        storage(FIVE).replace("510.25, 0., 322.5, 0., 505.75, 237.125", "0.8, 0., 0.5, 0., 1.05, 0.5"),
-        {},
-        "must hold fx, fy, cx, cy in px, got .* for frames of 640 x 480 px; multiply shares by the width",
-    ),
+    "a matrix twice, JSON": ('{"image_width": 640, "K": [1], "K": [2]}', {}, TWICE),
+    "a matrix twice, XML": ("<opencv_storage><K>1</K><K>2</K></opencv_storage>", {}, TWICE),
+    "shares of the frame": (SHARES, {}, "fx, fy, cx, cy in px, got .* for frames of 640 x 480 px; multiply shares by"),
     "a model of others": (storage(FIVE), {"model": "omni"}, "model must be one of opencv, fisheye, got 'omni'"),
     "a fisheye without k": (message((), "equidistant"), {}, "must hold the four coefficients of a fisheye"),
     "a fisheye with five": (message(FIVE, "equidistant"), {}, "must be 4 numbers for the model fisheye, got 5"),
@@ -296,30 +280,12 @@ REFUSED = {
     "ROS, not calibrated": (ZERO_K, {}, "fx must be above 0"),
     "Kalibr, two cameras": (CHAIN, {}, "name must be one of the cameras in .*: cam0, cam1; got None"),
     "Kalibr, another name": (CHAIN, {"name": "left"}, "cam0, cam1; got 'left'"),
-    "Kalibr, omni": (
-        ONE_CAMERA.replace("pinhole", "omni"),
-        {},
-        "camera_model of pinhole, got .* 'omni'; calibrate aga",
-    ),
-    "Kalibr, ds": (ONE_CAMERA.replace("pinhole", "ds"), {}, "got .* 'ds'; calibrate again with pinhole-radtan"),
-    "Kalibr, eucm": (ONE_CAMERA.replace("pinhole", "eucm"), {}, "got .* 'eucm'; calibrate again"),
-    "Kalibr, fov": (
-        ONE_CAMERA.replace("radtan", "fov"),
-        {},
-        "radtan, equidistant, none, got .* 'fov'; calibrate again",
-    ),
-    "Kalibr, none with k1": (ONE_CAMERA.replace("radtan", "none"), {}, "no distortion_coeffs for .*; state radtan or"),
+    "Kalibr, omni": (kalibr_with("pinhole", "omni"), {}, "camera_model of pinhole, got .* 'omni'; calibrate aga"),
+    "Kalibr, fov": (kalibr_with("radtan", "fov"), {}, "radtan, equidistant, none, got .* 'fov'; calibrate again"),
+    "Kalibr, none with k1": (kalibr_with("radtan", "none"), {}, "no distortion_coeffs for .*; state radtan or"),
     "Kalibr, empty fisheye": (EMPTY_CHAIN.replace("radtan", "equidistant"), {}, "must hold 4 numbers as distortion_co"),
-    "ORB-SLAM, no type": (
-        ORB_UNTYPED,
-        {},
-        "k1, k2, p1, p2, k3 of a PinHole, got .* with Camera1.k4; state Camera.type",
-    ),
-    "ORB-SLAM, no size": (
-        ORB_SLAM.replace("Camera.width", "w"),
-        {},
-        "must hold Camera.width, got .*; add it, or state width",
-    ),
+    "ORB-SLAM, no type": (ORB_UNTYPED, {}, "k3 of a PinHole, got .* with Camera1.k4; state Camera.type"),
+    "ORB-SLAM, no size": (ORB_SLAM.replace("Camera.width", "w"), {}, "hold Camera.width, got .*; add it, or state"),
     "VINS, MEI": (VINS.replace("KANNALA_BRANDT", "MEI"), {}, "of PINHOLE, KANNALA_BRANDT, got .* 'MEI'; calibrate"),
     "another XML": ("<document><chunk/></document>", {}, f"{UNKNOWN} <document>; create"),
     "TOML": ("[cams.0]\nsize = [640, 480]\n", {}, f"{UNKNOWN} other text .*; create"),

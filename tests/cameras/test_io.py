@@ -52,21 +52,6 @@ def test_a_covariance_is_read_back_and_varies_a_lens(vector, ending, tmp_path, m
         io.write_opencv(path, camera, covariance=np.eye(9))
 
 
-@pytest.mark.parametrize("ending", [".yaml", ".xml"])
-def test_files_written_by_opencv_are_read(ending, tmp_path, make_camera):
-    camera = make_camera((-0.28, 0.17, 8e-4, -4e-20, -0.05))
-    path = tmp_path / f"camera{ending}"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("calibration_time", "today")
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    storage.write("camera_matrix", np.array(camera.matrix))
-    storage.write("distortion_coefficients", np.array([camera.coefficients]).T)
-    storage.write("per_view_reprojection_errors", np.ones((3, 1), dtype=np.float32))
-    storage.release()
-    assert io.read_opencv(path) == camera
-
-
 # The layout of ROS's camera_calibration, with values like those of its documentation.
 ROS = """image_width: 640
 image_height: 480
@@ -258,11 +243,8 @@ distortion_coefficients: !!opencv-matrix
         ("camera.yaml", "0.1, 0., 0., 0.", "0., 0.", "4 x 1 numbers as distortion_coefficients, got .* with 2"),
         ("camera.xml", OPENCV, "<opencv_storage><image_width>64", r"path must hold XML, got .*camera.xml: "),
         ("camera.xml", OPENCV, "\udcff", "path must hold text in UTF-8"),
-        ("ost.yaml", "plumb_bob", "thin_prism", "distortion_model of plumb_bob, .*, equidistant, got .*thin_prism"),
         ("ost.yaml", "438.783367", "-1", "a camera, got .*ost.yaml: fx must be above 0, got -1"),
         ("ost.yaml", "data: [438", "date: [438", "path must hold a matrix as camera_matrix, got "),
-        ("chain.yaml", "pinhole", "omni", "camera_model of pinhole, got .*cam0, with 'omni'"),
-        ("chain.yaml", "radtan", "fov", "distortion_model of radtan, equidistant, none, got .*cam0, with 'fov'"),
         ("chain.yaml", "[752, 480]", "[752]", "path must hold 2 numbers as resolution, got .* with 1"),
         ("chain.yaml", "0.0001]", "]", "path must hold 4 numbers as distortion_coeffs, got .* with 3"),
         ("chain.yaml", "intrinsics: [461", "other: [461", "path must hold intrinsics, got .* with cam_overlaps"),

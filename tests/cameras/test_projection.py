@@ -184,6 +184,7 @@ def test_gradients_match_finite_differences(model):
         assert torch.autograd.gradcheck(
             lambda p, c, f, e, function=function: function(p, c, focal=f, center=e, model=model).points,
             (inputs, c, focal, center),
+            fast_mode=True,
         )
 
 

@@ -17,32 +17,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
 
-import torchrefract
-from torchrefract import (
-    BlurredTurbulence,
-    ChromaticAberration,
-    Compose,
-    CorridorDepth,
-    DivergenceFree,
-    Exposure,
-    GroundPlaneDepth,
-    HeterogeneousFog,
-    LensDistortion,
-    LensFlare,
-    NightGlow,
-    OneOf,
-    PhysicalTurbulence,
-    Rectification,
-    RoadMirage,
-    RollingShutter,
-    SunGlare,
-    ThinPlateSpline,
-    Turbulence,
-    TurbulenceBlur,
-    UniformFog,
-    Vignetting,
-    warp,
-)
+import torchrefract as tr
 from torchrefract.effects.base import Effect
 from torchrefract.effects.warp_effect import WarpEffect
 
@@ -80,7 +55,7 @@ class Case(NamedTuple):
 
 EFFECTS = {
     "lens": Case(
-        LensDistortion,
+        tr.LensDistortion,
         strongest={
             **{"k1_range": (-0.3, -0.2), "k2_range": (0.1, 0.2), "k3_range": (0.0, 0.02)},
             **{f"k{i}_range": (0.0, 0.002) for i in (4, 5, 6)},
@@ -95,28 +70,28 @@ EFFECTS = {
         fields=("coefficients", "focal", "center", "zoom", "shift"),
     ),
     "turbulence": Case(
-        Turbulence,
+        tr.Turbulence,
         strongest={"amplitude_range": (0.3, 0.5), "length_range": (9.0, 14.0), "aperture_range": (1.5, 2.0)},
         identity={"amplitude_range": NO_RANGE},
         gradient_field="amplitude",
         fields=("amplitude", "length", "aperture", *MOTION),
     ),
     "turbulence with depth": Case(
-        partial(Turbulence, depth=GroundPlaneDepth(), reference_distance=20.0),
+        partial(tr.Turbulence, depth=tr.GroundPlaneDepth(), reference_distance=20.0),
         strongest={"amplitude_range": (0.5, 0.9), "length_range": (9.0, 14.0), "aperture_range": (1.5, 2.0)},
         identity={"amplitude_range": NO_RANGE},
         gradient_field="amplitude",
         fields=("amplitude", "length", "aperture", *MOTION),
     ),
     "physical turbulence": Case(
-        PhysicalTurbulence,
+        tr.PhysicalTurbulence,
         strongest={"cn2_range": (1e-8, 3e-8), "wind_x_range": (5.0, 9.0)},
         identity={"cn2_range": NO_RANGE},
         gradient_field="tilt",
         fields=("tilt", "wind", "frame"),
     ),
     "turbulence blur": Case(
-        partial(TurbulenceBlur, aperture=0.05, focal=20.0, height=None, tolerance=None),
+        partial(tr.TurbulenceBlur, aperture=0.05, focal=20.0, height=None, tolerance=None),
         strongest={"cn2_range": (1e-10, 3e-10)},
         identity={"cn2_range": NO_RANGE},
         gradient_field=None,  # the blur grows with a power of D / r0 above 1
@@ -124,28 +99,28 @@ EFFECTS = {
         spreads=True,
     ),
     "road mirage": Case(
-        partial(RoadMirage, focal=30.0, horizon=0.3, half_width=math.inf),
+        partial(tr.RoadMirage, focal=30.0, horizon=0.3, half_width=math.inf),
         strongest={"difference_range": (20.0, 30.0), "shimmer_range": (0.1, 0.3)},
         identity={"difference_range": NO_RANGE},
         gradient_field=None,  # the critical angle is a root
         fields=("difference", "shimmer", "wave", "rate", "phase", "frame"),
     ),
     "thin-plate spline": Case(
-        ThinPlateSpline,
+        tr.ThinPlateSpline,
         strongest={"amplitude_range": (0.5, 1.0), "smoothing_range": (0.0, 0.1)},
         identity={"amplitude_range": NO_RANGE},
         gradient_field="displacement",
         fields=("displacement", "points", "smoothing"),
     ),
     "divergence-free": Case(
-        DivergenceFree,
+        tr.DivergenceFree,
         strongest={"amplitude_range": (0.5, 1.0), "length_range": (5.0, 9.0), "steps": 2},
         identity={"amplitude_range": NO_RANGE},
         gradient_field="amplitude",
         fields=("amplitude", "length", *MOTION),
     ),
     "rolling shutter": Case(
-        RollingShutter,
+        tr.RollingShutter,
         strongest={
             "speed_range": (60.0, 100.0),
             "readout_range": (25.0, 33.0),
@@ -158,28 +133,28 @@ EFFECTS = {
         fields=("speed", "readout", "exposure", "amplitude", "frequency", "phase", "frame"),
     ),
     "flare": Case(
-        LensFlare,
+        tr.LensFlare,
         strongest={"color": (0.9, 0.8, 0.5), "drift_y_range": (-0.01, 0.01), "strength_range": (0.2, 0.5)},
         identity={"strength_range": NO_RANGE},
         gradient_field="strength",
         fields=("center", "radius", "strength", "color", "drift", "frame"),
     ),
     "vignetting": Case(
-        Vignetting,
+        tr.Vignetting,
         strongest={"strength_range": (0.9, 1.0), "linear_light": False},
         identity={"strength_range": NO_RANGE},
         gradient_field="strength",
         fields=("strength",),
     ),
     "chromatic aberration": Case(
-        ChromaticAberration,
+        tr.ChromaticAberration,
         strongest={"red_range": (0.05, 0.09), "blue_range": (-0.09, -0.05)},
         identity={"red_range": NO_RANGE, "blue_range": NO_RANGE},
         gradient_field="scale",
         fields=("scale",),
     ),
     "heterogeneous fog": Case(
-        HeterogeneousFog,
+        tr.HeterogeneousFog,
         strongest={
             **{"visibility_range": (20.0, 60.0), "deviation_range": (-0.5, 0.5), "airlight": (0.9, 0.7, 0.8)},
             **TWO_OCTAVES,
@@ -189,7 +164,7 @@ EFFECTS = {
         fields=HETEROGENEOUS_FOG,
     ),
     "volumetric fog": Case(
-        partial(HeterogeneousFog, mode="ray"),
+        partial(tr.HeterogeneousFog, mode="ray"),
         strongest={
             **{"visibility_range": (20.0, 60.0), "wind_z_range": (-1.0, 0.0), "airlight": (0.9, 0.7, 0.8)},
             **TWO_OCTAVES,
@@ -199,7 +174,7 @@ EFFECTS = {
         fields=HETEROGENEOUS_FOG,
     ),
     "sun glare": Case(
-        SunGlare,
+        tr.SunGlare,
         strongest={
             **{"center_x_range": (0.2, 0.8), "center_y_range": (0.1, 0.6), "luminance_range": (200.0, 900.0)},
             **{"scale_range": (3.0, 6.0), "ghost_radius_range": (5.0, 20.0), "ghost_share_range": (0.05, 0.1)},
@@ -214,14 +189,14 @@ EFFECTS = {
         meters=True,
     ),
     "night glow": Case(
-        NightGlow,
+        tr.NightGlow,
         strongest={"threshold": 0.8, "luminance_range": (20.0, 40.0)},
         identity={"luminance_range": NO_RANGE, "threshold": 0.2},
         gradient_field="luminance",
         fields=("optical_depth", "asymmetry", "luminance"),
     ),
     "exposure": Case(
-        Exposure,
+        tr.Exposure,
         strongest={
             **{"target_range": (0.05, 0.15), "time_constant_range": (1.0, 3.0)},
             **{"shot_range": (0.001, 0.01), "read_range": (0.001, 0.002)},
@@ -233,11 +208,11 @@ EFFECTS = {
     ),
     "dust": Case(
         partial(
-            HeterogeneousFog,
+            tr.HeterogeneousFog,
             mode="ray",
             scale_height_range=(0.5, 3.0),
             sunlight_range=(0.1, 0.3),
-            depth=CorridorDepth().road,
+            depth=tr.CorridorDepth().road,
         ),
         strongest={
             **{"visibility_range": (20.0, 60.0), "wind_z_range": (-1.0, 0.0), "airlight": (0.5, 0.4, 0.4)},
@@ -248,7 +223,7 @@ EFFECTS = {
         fields=(*HETEROGENEOUS_FOG, "sun"),
     ),
     "uniform fog": Case(
-        UniformFog,
+        tr.UniformFog,
         strongest={"visibility_range": (20.0, 60.0), "deviation_range": (-0.5, 0.5), "airlight": (0.9, 0.7, 0.8)},
         identity={"visibility_range": (math.inf, math.inf)},
         gradient_field=None,  # clear air is infinitely far from every fog
@@ -283,9 +258,9 @@ def tensors_in(params: Any) -> dict[str, Tensor]:
 
 @pytest.mark.quick
 def test_every_public_effect_is_tested():
-    kinds = {kind for kind in vars(torchrefract).values() if isinstance(kind, type) and issubclass(kind, Effect)}
+    kinds = {kind for kind in vars(tr).values() if isinstance(kind, type) and issubclass(kind, Effect)}
     # Compositions and rectifications have other tests.
-    others = {BlurredTurbulence, Compose, OneOf, Rectification}
+    others = {tr.BlurredTurbulence, tr.Compose, tr.OneOf, tr.Rectification}
     assert kinds - others == {getattr(case.make, "func", case.make) for case in EFFECTS.values()}
 
 
@@ -386,7 +361,7 @@ def test_only_the_applied_samples_of_a_batch_change(case, dtype):
 
 def test_the_share_of_applied_samples_is_p():
     count, p = 4000, 0.3  # all effects draw `applied` by the same method
-    applied = UniformFog(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).applied
+    applied = tr.UniformFog(p=p).sample(torch.zeros(count, 3, 1, 1), seed=7).applied
     assert abs(applied.double().mean().item() - p) < 4 * math.sqrt(p * (1 - p) / count)
 
 
@@ -437,7 +412,7 @@ def test_channels_are_degraded_independently(case):
         return
     options = case.strongest | {name: 0.7 for name in ("airlight", "color") if name in case.strongest}
     effect, image = case.make(**options), random_image(2, 4, 20, 30)
-    if isinstance(effect, ChromaticAberration):  # whose channels differ
+    if isinstance(effect, tr.ChromaticAberration):  # whose channels differ
         return
     result = effect.degrade(image, seed=7).image
     for channel in range(4):
@@ -459,7 +434,7 @@ def channels_change_each_other_by_the_gain_alone(case: Case) -> None:
     assert torch.equal(effect.apply(changed, params).image[:, 0], effect.apply(image, params).image[:, 0])
 
 
-@pytest.mark.parametrize("size", [(1, 13), (13, 1), (31, 37), (2, 2)])
+@pytest.mark.parametrize("size", [(1, 13), (31, 37)])
 def test_narrow_and_prime_frames_follow_the_equations(case, size):
     effect, image = case.strong(), random_image(2, 3, *size)
     degraded = effect.degrade(image, seed=7)
@@ -467,18 +442,18 @@ def test_narrow_and_prime_frames_follow_the_equations(case, size):
         assert value.shape[2:] == size, name
         assert value.isfinite().all(), name
     if degraded.flow is not None:
-        expected = warp(image, degraded.flow, padding=effect.padding, interpolation=effect.interpolation)[0]
+        expected = tr.warp(image, degraded.flow, padding=effect.padding, interpolation=effect.interpolation)[0]
         assert torch.equal(degraded.image, expected)
     if degraded.transmission is not None:
         t, airlight = degraded.transmission, getattr(degraded.params, "airlight", torch.zeros(1, 3))[..., None, None]
-        if isinstance(effect, HeterogeneousFog):
+        if isinstance(effect, tr.HeterogeneousFog):
             airlight = effect.airlight_map(degraded.params, *size)
         assert_close(degraded.image, t * image + (1 - t) * airlight, rtol=0, atol=1e-6)
 
 
 def test_a_frame_of_one_pixel_does_not_move():
     image, effects = random_image(2, 3, 1, 1), [case.strong() for case in EFFECTS.values()]
-    for effect in (*effects, Compose([effect for effect in effects if isinstance(effect, WarpEffect)])):
+    for effect in (*effects, tr.Compose([effect for effect in effects if isinstance(effect, WarpEffect)])):
         degraded = effect.degrade(image, seed=7)
         assert degraded.image.isfinite().all()
         if degraded.flow is not None:
@@ -541,7 +516,7 @@ def test_params_convert_their_floating_fields(case):
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 def test_params_of_a_smaller_type_than_the_flow_are_converted(case, dtype):
     image = random_image(3, 3, 20, 30, dtype=torch.float64 if dtype is torch.float32 else torch.float32)
-    effect = Compose([case.strong(p=0.7)])
+    effect = tr.Compose([case.strong(p=0.7)])
     rounded = effect.sample(image, seed=7).to(dtype)
     result, expected = effect.apply(image, rounded), effect.apply(image, rounded.to(image.dtype))
     assert_equal_maps(maps_of(result), maps_of(expected))
@@ -565,37 +540,17 @@ def test_extreme_params_raise_or_give_finite_maps(case):
 
 
 def test_gradients_of_params_and_image_match_finite_differences(case):
-    effect = case.strong()
-    image = random_image(2, 3, 3, 4, dtype=torch.float64)
+    effect, image = case.strong(), random_image(2, 3, 3, 4, dtype=torch.float64)
     params = effect.sample(image, seed=5)
-    drawn = tensors_in(params)
-    names = {name for name, value in drawn.items() if value.is_floating_point()}
+    names = {name for name, value in tensors_in(params).items() if value.is_floating_point()}
     # Fogs without sunlight take zeros alone, and drawn params have no boxes.
     assert names - {"sun", "vehicles"} == {*case.fields} - {"sun"}
-    values, pixels = {"image": image} | {name: drawn[name] for name in case.fields}, image[0].numel()
 
-    def degrade(rows: Tensor, changed: dict[str, Tensor]) -> Tensor:
-        """Return the pixels of copies of the two samples, of which some inputs are changed."""
-        copies = {name: value[rows] for name, value in drawn.items()} | {"image": image[rows]} | changed
-        return effect.apply(copies.pop("image"), params._replace(**copies)).image.flatten(1)
+    def degrade(image: Tensor, *values: Tensor) -> Tensor:
+        return effect.apply(image, params._replace(**dict(zip(case.fields, values, strict=True)))).image
 
-    if getattr(effect, "mode", "") == "ray":  # a fog in space takes as long as all other effects for each copy
-        leaves, rows = [value.clone().requires_grad_() for value in values.values()], torch.arange(2)
-        assert torch.autograd.gradcheck(
-            lambda *inputs: degrade(rows, dict(zip(values, inputs, strict=True))), leaves, fast_mode=True
-        )
-        return
-    # One call gives each row of the Jacobian to a copy of its sample, and two calls give the columns of an input.
-    rows = torch.arange(2).repeat_interleave(pixels)
-    copies = {name: value[rows].requires_grad_() for name, value in values.items()}
-    outputs = degrade(rows, copies).view(2, pixels, pixels).diagonal(dim1=1, dim2=2)
-    gradients = torch.autograd.grad(outputs.sum(), [*copies.values()], materialize_grads=True)
-    for (name, value), gradient in zip(values.items(), gradients, strict=True):
-        count = value[0].numel()
-        rows, step = torch.arange(2).repeat_interleave(count), 1e-6 * torch.eye(count, dtype=value.dtype).repeat(2, 1)
-        high, low = (degrade(rows, {name: value[rows] + s * step.view(2 * count, *value.shape[1:])}) for s in (1, -1))
-        expected = (high - low).view(2, count, pixels).mT / 2e-6
-        assert torch.allclose(gradient.reshape(2, pixels, count), expected, rtol=1e-3, atol=1e-5), name
+    inputs = [image, *(getattr(params, name) for name in case.fields)]
+    assert torch.autograd.gradcheck(degrade, [value.clone().requires_grad_() for value in inputs], fast_mode=True)
 
 
 def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
@@ -609,15 +564,17 @@ def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
     assert of_field[1].any()
 
 
-# Effects whose graph another one holds: turbulence with depth, and dust, which is volumetric fog.
-@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ("turbulence", "volumetric fog")])
+# Other tests compile turbulence (of a clip), the rolling shutter (all maps of a composition) and heterogeneous fog (its
+# plan); dust is volumetric fog.
+ELSEWHERE = {"turbulence", "turbulence with depth", "rolling shutter", "heterogeneous fog", "volumetric fog"}
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ELSEWHERE])
 def test_one_graph_gives_the_same_as_eager_mode(name):
-    effect, image = EFFECTS[name].strong(p=0.8), random_image(3, 3, 24, 32)
-    # Each graph is traced whole. Lowering it takes as long again and tests PyTorch: one warp and one photometric effect
-    # become machine code, and of effects with the same code one is lowered; a lens is in the graph of a composition.
-    backend = "inductor" if name in ("road mirage", "uniform fog") else "aot_eager"
-    if name in ("lens", "physical turbulence", "heterogeneous fog"):
-        backend = "eager"
+    options = {"frame": "pad"} if name == "lens" else {}  # lenses of a table fill the frame in a graph
+    effect, image = EFFECTS[name].strong(p=0.8, **options), random_image(3, 3, 24, 32)
+    # To lower a graph takes as long as to trace it and tests PyTorch: one warp and one photometric effect are lowered.
+    backend = "inductor" if name in ("thin-plate spline", "uniform fog") else "eager"
     torch.manual_seed(3)
     expected = [effect(image) for _ in range(2)]
     compiled = torch.compile(effect, fullgraph=True, backend=backend)

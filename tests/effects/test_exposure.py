@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import decode, encode
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -16,14 +17,6 @@ SIZE = (24, 32)
 
 def picture(*shape: int, brightness: float = 1.0, seed: int = 0) -> Tensor:
     return brightness * torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def decode(stored: np.ndarray) -> np.ndarray:
-    return np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
-
-
-def encode(light: np.ndarray) -> np.ndarray:
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def fixed(**options: Any) -> Exposure:

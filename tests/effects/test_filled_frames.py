@@ -4,10 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy_lens import NumpyLens
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchrefract import LensDistortion, LensParams, OneOf, Rectification, presets, warp_points
+from torchrefract import LensDistortion, OneOf, Rectification, presets, warp_points
 from torchrefract.cameras import Camera
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 
@@ -19,56 +20,9 @@ DECENTERED: dict[str, Any] = {
 }
 
 
-def distorted(points: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return points (..., 2) of the plane z = 1 through the lens, from the formula of the model alone."""
-    k, (p1, p2, s1, s2, s3, s4) = c[:6], c[6:]
-    x, y = points[..., 0], points[..., 1]
-    r2 = x * x + y * y
-    g = 1 + sum(value * r2**i for i, value in enumerate(k, start=1))
-    return np.stack(
-        [
-            x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2,
-            y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2,
-        ],
-        axis=-1,
-    )
-
-
-def undistorted(points: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Invert `distorted` by fixed-point steps and a secant, independent of the library's Newton method."""
-    step = 1e-6
-    x = points.copy()
-    for _ in range(60):
-        error = distorted(x, c) - points
-        if np.abs(error).max() < 1e-14:
-            break
-        columns = [(distorted(x + step * axis, c) - distorted(x - step * axis, c)) / (2 * step) for axis in np.eye(2)]
-        x = x - np.linalg.solve(np.stack(columns, axis=-1), error[..., None])[..., 0]
-    assert np.abs(distorted(x, c) - points).max() < 1e-12
-    return x
-
-
-class Lens:
-    """One sample of drawn lenses, in px of a frame."""
-
-    def __init__(self, params: LensParams, i: int, height: int, width: int):
-        assert params.zoom is not None
-        assert params.shift is not None
-        self.c = params.coefficients[i].double().numpy()
-        self.focal = params.focal[i].double().numpy() * width
-        self.center = (np.array([width, height]) - 1) / 2 + params.center[i].double().numpy() * width
-        self.clean_focal = self.focal * params.zoom[i].item()
-        self.clean_center = self.center + params.shift[i].double().numpy() * width
-
-    def source(self, pixels: np.ndarray) -> np.ndarray:
-        return self.clean_focal * undistorted((pixels - self.center) / self.focal, self.c) + self.clean_center
-
-    def target(self, pixels: np.ndarray) -> np.ndarray:
-        return self.focal * distorted((pixels - self.clean_center) / self.clean_focal, self.c) + self.center
-
-
 def pixels(height: int, width: int) -> np.ndarray:
-    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    """Return x and y of all pixels, (2, n)."""
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height))).reshape(2, -1).astype(float)
 
 
 def at_least(value: Tensor | None) -> Tensor:
@@ -83,23 +37,13 @@ def test_no_pixel_of_2000_drawn_lenses_is_without_a_source(severity):
     assert d.params.zoom.max() <= 1
 
 
-@pytest.mark.parametrize("tolerance_px", [0.02, None])
-@pytest.mark.parametrize("size", [(90, 160), (160, 90), (64, 64)])
-def test_decentered_lenses_fill_their_frames(size, tolerance_px):
-    effect = LensDistortion(**DECENTERED, tolerance_px=tolerance_px)
-    d = effect.degrade(torch.zeros(100, 1, *size), seed=1)
-    assert d.valid.all()
-    assert d.params.shift.abs().max() > 0.01
-
-
 @pytest.mark.parametrize("arguments", [{}, DECENTERED], ids=["default", "decentered"])
 def test_the_zoom_is_the_largest_that_fits_every_pixel(arguments):
     height, width = 72, 128
     params = LensDistortion(**arguments).sample(torch.zeros(20, 1, height, width), seed=2)
     for i in range(20):
-        lens = Lens(params, i, height, width)
-        reached = lens.source(pixels(height, width))
-        gaps = [reached.min(axis=(0, 1)), np.array([width, height]) - 1 - reached.max(axis=(0, 1))]
+        reached = NumpyLens(params, i, height, width).source(pixels(height, width))
+        gaps = [reached.min(axis=1), np.array([width, height]) - 1 - reached.max(axis=1)]
         assert np.min(gaps) >= 0
         # Along one axis the view reaches both borders, or the frame would be seen larger; the margin is 1/16 px, and
         # fitting the corners of the pixels takes up to half a pixel more.
@@ -114,16 +58,16 @@ def test_both_flows_agree_with_an_independent_lens_in_float64(dtype):
     limit = 2e-3 if dtype is torch.float32 else 1e-7
     grid = pixels(height, width)
     for i in range(6):
-        lens = Lens(d.params, i, height, width)
-        flow, restore = (value[i].permute(1, 2, 0).numpy() for value in (d.flow, d.restore_flow))
+        lens = NumpyLens(d.params, i, height, width)
+        flow, restore = (value[i].flatten(1).numpy() for value in (d.flow, d.restore_flow))
         assert np.abs(grid + flow - lens.source(grid)).max() < limit
-        valid = d.restore_valid[i, 0].numpy()
+        valid = d.restore_valid[i].flatten().numpy()
         assert valid.mean() > 0.4
-        assert np.abs(grid + restore - lens.target(grid))[valid].max() < limit
+        assert np.abs(grid + restore - lens.target(grid))[:, valid].max() < limit
 
 
 def test_planned_flows_of_filled_frames_are_within_the_tolerance():
-    for severity in presets.SEVERITIES:
+    for severity in (1, 5):
         effect = presets.cheap_dashcam(severity)
         image = torch.zeros(3, 1, 270, 480)
         planned, exact = effect.degrade(image, seed=4), effect.exact().degrade(image.double(), seed=4)
@@ -153,17 +97,11 @@ def test_pincushion_lenses_need_no_zoom():
     assert d.valid.all()
 
 
-def test_a_lens_without_distortion_stays_the_identity():
-    effect = LensDistortion(k1_range=(0.0, 0.0), k2_range=(0.0, 0.0), p1_range=(0.0, 0.0), p2_range=(0.0, 0.0))
-    image = torch.rand(2, 3, 20, 30)
-    assert effect.degrade(image, seed=0).image.equal(image)
-
-
 def test_lenses_that_were_drawn_for_one_size_fill_frames_of_other_sizes():
     effect = LensDistortion(**DECENTERED)
-    params = effect.sample(torch.zeros(50, 1, 90, 160), seed=6)
+    params = effect.sample(torch.zeros(20, 1, 90, 160), seed=6)
     for size in ((45, 80), (91, 161), (180, 320)):
-        assert effect.apply(torch.zeros(50, 1, *size), params).valid.all()
+        assert effect.apply(torch.zeros(20, 1, *size), params).valid.all()
 
 
 def test_another_zoom_than_that_of_the_plan_is_computed_exactly():
@@ -172,8 +110,8 @@ def test_another_zoom_than_that_of_the_plan_is_computed_exactly():
     params = effect.sample(image, seed=0)._replace(zoom=torch.tensor([0.4, 0.3]))
     d, grid = effect.apply(image, params), pixels(72, 128)
     for i in range(2):
-        lens = Lens(params, i, 72, 128)
-        assert np.abs(grid + d.flow[i].permute(1, 2, 0).numpy() - lens.source(grid)).max() < 2e-3
+        expected = NumpyLens(params, i, 72, 128).source(grid)
+        assert np.abs(grid + d.flow[i].flatten(1).numpy() - expected).max() < 2e-3
 
 
 @pytest.mark.parametrize(("name", "value", "message"), [("zoom", 1.5, "zoom must"), ("zoom", 0.0, "zoom must")])
@@ -233,7 +171,7 @@ def test_a_cropped_rectification_shows_valid_pixels_only_and_as_many_as_it_can(r
         outside = (shown.points < 0) | (shown.points > torch.tensor([159.0, 89.0]))
         assert outside.any() or not shown.valid.all()
     # The pixel of a ray in the rectified frame is taken from its pixel in the raw one.
-    grid = torch.from_numpy(pixels(90, 160).reshape(-1, 2))
+    grid = torch.from_numpy(pixels(90, 160).T)
     expected = raw.project(pinhole.unproject(grid).points)
     assert_close(grid + d.flow[0].flatten(1).T, expected.points, atol=0.02, rtol=0)
     residual = d.restore_residual[d.restore_valid]

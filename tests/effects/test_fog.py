@@ -1,9 +1,11 @@
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers import decode, encode, random_image
 from scipy import stats
 from torch import Tensor
 from torch.testing import assert_close
@@ -11,11 +13,8 @@ from torch.testing import assert_close
 from torchrefract import Camera, FogParams, HeterogeneousFog, LinearDepth, UniformFog, remove_fog
 from torchrefract.fields.airlight import airlight_of_frame
 
+picture = partial(random_image, dtype=torch.float64)
 PAPER_AIRLIGHT = (220 / 255, 220 / 255, 235 / 255)
-
-
-def picture(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
 
 
 def fog_params(image: Tensor, visibility: float, deviation: float = 0.0) -> FogParams:
@@ -26,14 +25,6 @@ def fog_params(image: Tensor, visibility: float, deviation: float = 0.0) -> FogP
         deviation=torch.full((batch,), deviation, dtype=dtype),
         airlight=torch.tensor([PAPER_AIRLIGHT[: image.shape[1]]] * batch, dtype=dtype),
     )
-
-
-def to_linear(stored: np.ndarray) -> np.ndarray:
-    return np.where(stored <= 0.04045, stored / 12.92, np.power((stored + 0.055) / 1.055, 2.4))
-
-
-def to_stored(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055)
 
 
 @pytest.mark.quick
@@ -53,9 +44,7 @@ def test_the_image_is_the_closed_form(dtype, linear_light, has_depth):
     t = np.broadcast_to(np.exp(-k * d), (2, 1, 20, 30))
     clean, airlight = image.double().numpy(), np.array(PAPER_AIRLIGHT)[None, :, None, None]
     expected = (
-        to_stored(to_linear(clean) * t + to_linear(airlight) * (1 - t))
-        if linear_light
-        else clean * t + airlight * (1 - t)
+        encode(decode(clean) * t + decode(airlight) * (1 - t)) if linear_light else clean * t + airlight * (1 - t)
     )
     assert_close(degraded.image.double(), torch.from_numpy(expected), rtol=0, atol=1e-6)
     assert_close(degraded.transmission.double(), torch.from_numpy(t.copy()), rtol=0, atol=1e-6)

@@ -64,16 +64,6 @@ def test_an_effect_moves_the_target_between_transforms_of_torchvision_v2(effect,
     assert_close(moved["boxes"].as_subclass(Tensor), mirrored, rtol=0, atol=1e-4)
 
 
-@pytest.mark.quick
-def test_an_effect_works_inside_a_sequential(effect):
-    image = random_frames(3, 3)
-    blur, mix = nn.AvgPool2d(3, stride=1, padding=1), nn.Conv2d(3, 2, 1)
-    torch.manual_seed(3)
-    result = nn.Sequential(blur, effect, mix)(image)
-    torch.manual_seed(3)
-    assert torch.equal(result, mix(effect(blur(image))))
-
-
 @pytest.mark.parametrize("name", ["ImageSequential", "AugmentationSequential"])
 def test_an_effect_works_between_augmentations_of_kornia(effect, name):
     augmentation = pytest.importorskip("kornia.augmentation", reason="kornia is in the extra train")

@@ -167,8 +167,7 @@ def test_one_graph_draws_the_same_lenses():
     assert_close(torch.compile(effect, fullgraph=True, backend="eager")(image), expected, rtol=0, atol=2e-4)
 
 
-@pytest.mark.parametrize("tolerance", [0.3, 0.03])
-@pytest.mark.parametrize("table", [OTHERS, [CAR]], ids=["three", "one"])
+@pytest.mark.parametrize(("table", "tolerance"), [(OTHERS, 0.3), ([CAR], 0.03)], ids=["three", "one"])
 def test_lenses_of_a_table_stay_within_the_tolerance(table, tolerance):
     effect = LensDistortion.from_lenses(table, tolerance_px=tolerance)
     plan = effect.plan(180, 320)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import decode, encode
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -20,14 +21,6 @@ IN_FRAME: dict[str, Any] = {"center_x_range": (0.5, 0.9), "center_y_range": (0.1
 
 def picture(*shape: int, seed: int = 0) -> Tensor:
     return 0.7 * torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def decode(stored: np.ndarray) -> np.ndarray:
-    return np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
-
-
-def encode(light: np.ndarray) -> np.ndarray:
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def reference(image: np.ndarray, params, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from torchrefract import BlurredTurbulence, GroundPlaneDepth, PhysicalTurbulence, TurbulenceBlur
 from torchrefract.fields.physical_turbulence import fried_parameter
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
-from torchrefract.fields.turbulence_blur import View, blur_by_distance, halo_px, largest_change, num_distances
+from torchrefract.fields.turbulence_blur import View, blur_by_distance, distances_for, halo_px, largest_change
 
 WAVELENGTH, APERTURE, REACH = 600e-9, 0.004, 900.0
 CN2 = 1e-11
@@ -97,17 +97,24 @@ def test_each_pixel_is_blurred_by_the_air_in_front_of_it(with_height):
 @pytest.mark.parametrize("strength", [0.03, 1.0, 16.0, 3000.0])
 def test_the_contrast_is_right_to_two_percent_at_every_distance_and_frequency(strength):
     view = View((9000.0, 9000.0), APERTURE, WAVELENGTH)
-    count, width = num_distances(strength, view), 400
+    highest = 9000 / math.sqrt(2) * WAVELENGTH / APERTURE  # of the frame, in cut-offs
+    distances, width = distances_for(strength, view), 400
     strengths = strength * torch.linspace(0, 1, width, dtype=torch.float64).square().view(1, 1, 1, width)
     worst = 0.0
     for down in range(1, 32):  # each column has a distance of its own
         wave = cosine(32, width, down, 0)
-        blurred = blur_by_distance(wave[None, None], strengths, view, count=count, halo=width)
+        blurred = blur_by_distance(wave[None, None], strengths, view, distances=distances, halo=width)
         q = min(9000 * down / 64 * WAVELENGTH / APERTURE, 1)
         expected = torch.exp(-3.44 * strengths[0, 0, 0] * (q ** (5 / 3) - q**2 / 2))
         worst = max(worst, (blurred[0, 0, 0] / wave[0] - expected).abs().max().item())
     assert worst < ERROR
-    assert worst > ERROR / 6 or count == 2  # no more distances than it takes
+    # No more distances than it takes: without the last one the interpolation between the others is off by more.
+    places, rates = (np.array(values[:-1]) for values in distances[:2])
+    share = np.linspace(0, 1, 500)[:, None] ** 2
+    largest = strength * 3.44 * (highest ** (5 / 3) - highest**2 / 2)
+    basis = np.exp(-rates * share) @ np.linalg.inv(np.exp(-np.outer(places, rates)))
+    missed = basis @ np.exp(-largest * np.outer(places, share)) - np.exp(-largest * share * share.T)
+    assert np.abs(missed).max() > ERROR
 
 
 @pytest.mark.quick
@@ -128,13 +135,16 @@ def test_no_light_wraps_around_the_frame():
     everywhere = torch.full((1, 1, 1, 1), strength, dtype=torch.float64)
     halo = halo_px(strength, view)
     assert halo < 200  # the middle of the reflected frame is left out
-    blurred, exact = (blur_by_distance(light, everywhere, view, count=2, halo=px) for px in (halo, 600))
+    blurred, exact = (
+        blur_by_distance(light, everywhere, view, distances=distances_for(strength, view), halo=px)
+        for px in (halo, 600)
+    )
     assert_close(blurred, exact, rtol=0, atol=1e-3)
     assert exact[..., -1].max() < 1e-3
     # The rest of the light beyond the halo, by a frame that holds nearly all of it.
     point = torch.zeros(1, 1, 1601, 1601, dtype=torch.float64)
     point[..., 800, 800] = 1.0
-    spread = blur_by_distance(point, everywhere, view, count=2, halo=0)[0, 0]
+    spread = blur_by_distance(point, everywhere, view, distances=distances_for(strength, view), halo=0)[0, 0]
     y, x = torch.meshgrid(*(torch.arange(1601) - 800.0,) * 2, indexing="ij")
     beyond = spread[torch.hypot(y, x) > halo].sum().item()
     assert 0.0005 < beyond < 0.0012
@@ -160,10 +170,14 @@ def test_no_frame_changes_more_than_the_plan_says():
         # Light where the kernel of the middle pixel is above 0, and noise.
         point = torch.zeros(1, 1, 64, 64, dtype=torch.float64)
         point[..., 32, 32] = 1.0
-        kernel = blur_by_distance(point, everywhere, view, count=2, halo=64) - point
+        kernel = blur_by_distance(point, everywhere, view, distances=distances_for(strength, view), halo=64) - point
         frames = [(kernel > 0).double(), torch.rand(1, 1, 64, 64, generator=generator, dtype=torch.float64).round()]
         changes = [
-            (blur_by_distance(frame, everywhere, view, count=2, halo=64) - frame).abs().max().item() for frame in frames
+            (blur_by_distance(frame, everywhere, view, distances=distances_for(strength, view), halo=64) - frame)
+            .abs()
+            .max()
+            .item()
+            for frame in frames
         ]
         assert max(changes) <= bound * (1 + 1e-6)
         assert changes[0] > 0.9 * bound

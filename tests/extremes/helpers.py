@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.testing import assert_close
@@ -32,7 +33,7 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "chromatic aberration": partial(tr.ChromaticAberration, red_range=(0.02, 0.05)),
     "sun glare": tr.SunGlare,
     "night glow": tr.NightGlow,
-    "turbulence blur": partial(tr.TurbulenceBlur, cn2_range=(1e-11, 1e-10), focal=50.0),
+    "turbulence blur": partial(tr.TurbulenceBlur, cn2_range=(1e-11, 2e-11), focal=50.0),
     "exposure": partial(tr.Exposure, shot_range=(1e-4, 1e-3)),
     "compose": lambda: tr.Compose([tr.Turbulence(), tr.LensDistortion(), tr.UniformFog()]),
     "one of": lambda: tr.OneOf([tr.DivergenceFree(), tr.ThinPlateSpline(), tr.LensFlare()]),
@@ -45,6 +46,16 @@ def random_image(*shape: int, dtype: torch.dtype = torch.float32, device: str = 
     """Return uniform noise in [0, 1], or in 0 ... 255 for uint8."""
     image = torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return ((255 * image).round() if dtype is torch.uint8 else image).to(device, dtype)
+
+
+def decode(stored: np.ndarray) -> np.ndarray:
+    """Return linear light of values in sRGB, in [0, 1]."""
+    return np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
+
+
+def encode(light: np.ndarray) -> np.ndarray:
+    """Return sRGB values of linear light, in [0, 1]."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def maps_of(degraded: tr.Degraded) -> dict[str, Tensor]:

@@ -170,24 +170,6 @@ def frames(folder: Path) -> Iterator[Reader]:
     yield Reader(paths[0], PNG, read, (ValueError, UserWarning))
 
 
-def camera_files(folder: Path) -> Iterator[Reader]:
-    """Yield camera files of all formats, and a lens database."""
-    files: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
-        "opencv.yaml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
-        "opencv.xml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
-        "ros.yaml": (partial(camera_io.write_ros, camera=CAMERA), camera_io.read_ros),
-        "kalibr.yaml": (partial(camera_io.write_kalibr, cameras={"cam0": CAMERA}), camera_io.read_kalibr),
-        "cameras.txt": (partial(camera_io.write_colmap, cameras={1: CAMERA}), camera_io.read_colmap),
-        "lenses.csv": (lambda path: path.write_text(TABLE), read_lenses),
-        "cameras.bin": (lambda path: path.write_bytes(COLMAP_BINARY), camera_io.read_colmap),
-        "lensfun.xml": (lambda path: path.write_text(LENSFUN), partial(camera_io.read_camera, width=640, height=480)),
-    }
-    files |= {name: (partial(Path.write_text, data=text), camera_io.read_camera) for name, text in PROFILES.items()}
-    for name, (write, read) in files.items():
-        write(folder / name)
-        yield Reader(folder / name, (folder / name).read_bytes(), read, (ValueError, UserWarning))
-
-
 TABLE = ",".join(COLUMNS) + '\na,b,c,opencv,640,480,500,500,320,240,"[-0.3, 0.1, 0, 0]",,0.1,1,s,l\n'
 COLMAP_BINARY = struct.pack("<QiiQQ8d", 1, 1, 4, 640, 480, 500, 510, 320, 240, -0.3, 0.1, 0.001, 0.002)
 LENSFUN = """<lensdatabase><lens><model>a</model><cropfactor>2</cropfactor><aspect-ratio>640:480</aspect-ratio>
@@ -205,19 +187,24 @@ PROFILES = {
     "vins.yaml": "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: 480\nprojection_parameters:\n"
     + "".join(f"  {name}: {value}\n" for name, value in NUMBERS.items()),
 }
-CAMERA_FILES = (
-    *(
-        "opencv.yaml",
-        "opencv.xml",
-        "ros.yaml",
-        "kalibr.yaml",
-        "cameras.txt",
-        "lenses.csv",
-        "cameras.bin",
-        "lensfun.xml",
-    ),
-    *PROFILES,
-)
+WRITTEN: dict[str, tuple[Callable[..., Any], Callable[[Path], Any]]] = {  # writers and readers
+    "opencv.yaml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
+    "opencv.xml": (partial(camera_io.write_opencv, camera=CAMERA), camera_io.read_opencv),
+    "ros.yaml": (partial(camera_io.write_ros, camera=CAMERA), camera_io.read_ros),
+    "kalibr.yaml": (partial(camera_io.write_kalibr, cameras={"cam0": CAMERA}), camera_io.read_kalibr),
+    "cameras.txt": (partial(camera_io.write_colmap, cameras={1: CAMERA}), camera_io.read_colmap),
+    "lenses.csv": (partial(Path.write_text, data=TABLE), read_lenses),
+    "cameras.bin": (partial(Path.write_bytes, data=COLMAP_BINARY), camera_io.read_colmap),
+    "lensfun.xml": (partial(Path.write_text, data=LENSFUN), partial(camera_io.read_camera, width=640, height=480)),
+    **{name: (partial(Path.write_text, data=text), camera_io.read_camera) for name, text in PROFILES.items()},
+}
+
+
+def camera_files(folder: Path) -> Iterator[Reader]:
+    """Yield camera files of all formats, and a lens database."""
+    for name, (write, read) in WRITTEN.items():
+        write(folder / name)
+        yield Reader(folder / name, (folder / name).read_bytes(), read, (ValueError, UserWarning))
 
 
 @pytest.fixture
@@ -287,7 +274,7 @@ def test_threads_that_read_images_keep_the_log_level(tmp_path):
     assert all(torch.equal(image, expected) for image in results)
 
 
-@pytest.mark.parametrize("name", CAMERA_FILES)
+@pytest.mark.parametrize("name", WRITTEN)
 def test_an_invalid_value_in_a_camera_file_names_the_file(name, camera_file):
     reader = camera_file(name)
     values = [value for value in (b"640", b"500", b"radtan", b"plumb_bob", b"opencv") if value in reader.data]

@@ -133,7 +133,7 @@ def test_new_sizes_and_new_effects_do_not_keep_tensors(make, num_tensors):
     image = frame(size=(64, WIDTH))
     make().degrade(image[..., :HEIGHT, :], seed=7)
     before = num_tensors()
-    for i in range(8):
+    for i in range(4):
         rows = HEIGHT if make is EFFECTS["rectification"] else HEIGHT + i
         make().degrade(image[..., :rows, :], seed=7)
     assert num_tensors() <= before + 2
@@ -176,6 +176,10 @@ def test_workers_load_the_samples_of_one_process_and_do_not_grow(full_extremes):
         assert max(rest[len(rest) // 2 :]) - max(rest[: len(rest) // 2]) < 1.6
 
 
+def pickled(effect: Effect) -> Effect:
+    return pickle.loads(pickle.dumps(effect))
+
+
 def call_in_threads(function: Callable[[int], Any], count: int) -> list[Any]:
     """Call a function with 0 ... count - 1 in threads that start at the same moment."""
     barrier = threading.Barrier(THREADS)
@@ -189,14 +193,15 @@ def call_in_threads(function: Callable[[int], Any], count: int) -> list[Any]:
         return list(pool.map(call, range(count)))
 
 
-def test_threads_that_share_an_effect_get_the_results_and_gradients_of_one_thread(make, full_extremes):
-    # A new size for each round of calls, so that some threads make plans while others use them.
+def test_threads_that_share_or_copy_an_effect_get_the_results_and_gradients_of_one_thread(make, full_extremes):
+    # A new size for each round of calls, so that some threads make plans while others use or copy them.
     step = 0 if make is EFFECTS["rectification"] else 1
+    copies: tuple[Callable[[Effect], Effect], ...] = (lambda effect: effect, copy.deepcopy, pickled)
 
     def call(effect: Effect, number: int) -> tuple[dict[str, Tensor], Tensor]:
         scale = step * (number // THREADS % 7)
         image = frame(number, size=(HEIGHT + 4 * scale, WIDTH + 6 * scale), batch=2).requires_grad_()
-        degraded = effect.degrade(image, seed=7, keys=[number, -number])
+        degraded = copies[number % 3](effect).degrade(image, seed=7, keys=[number, -number])
         (gradient,) = torch.autograd.grad(degraded.image.square().sum(), image)
         return maps_of(degraded), gradient
 
@@ -206,18 +211,6 @@ def test_threads_that_share_an_effect_get_the_results_and_gradients_of_one_threa
         expected_maps, expected_gradient = call(effect, number)
         assert_close_maps(maps, expected_maps)
         torch.testing.assert_close(gradient, expected_gradient, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("copy_effect", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
-def test_an_effect_can_be_copied_while_threads_call_it(make, copy_effect):
-    effect, image = make(), frame()
-    expected = maps_of(effect.degrade(image, seed=7))
-
-    def call(number: int) -> dict[str, Tensor]:
-        return maps_of((copy_effect(effect) if number % 2 else effect).degrade(image, seed=7))
-
-    for maps in call_in_threads(call, 2 * THREADS):
-        assert_close_maps(maps, expected)
 
 
 def test_a_result_can_be_copied_while_threads_read_its_maps(make):

@@ -6,17 +6,11 @@ import torch
 from domain import IGNORE_STRENGTH, cases
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
-
-import torchrefract as tr
+from numpy_lens import NumpyLens, to_numpy
 
 FLOATS = (torch.float32, torch.float64)
 BOUND_PX = 0.05  # of `invert_flow`
 pytestmark = [IGNORE_STRENGTH, pytest.mark.usefixtures("small_domains")]
-
-
-def to_numpy(value: Tensor) -> np.ndarray:
-    return value.detach().double().numpy()
 
 
 def bilinear(flow: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -28,47 +22,6 @@ def bilinear(flow: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     s, t = x - left, y - top
     above = flow[:, top, left] * (1 - s) + flow[:, top, right] * s
     return above * (1 - t) + (flow[:, bottom, left] * (1 - s) + flow[:, bottom, right] * s) * t
-
-
-class Lens:
-    """The lens polynomial of one sample in NumPy, its derivatives, and a bound of its rounding."""
-
-    def __init__(self, params: tr.LensParams, i: int, height: int, width: int):
-        self.k, (self.p1, self.p2, *self.s) = np.split(to_numpy(params.coefficients[i]), [6])
-        self.focal = to_numpy(params.focal[i]) * width
-        self.center = (np.array([width, height]) - 1) / 2 + to_numpy(params.center[i]) * width
-        assert params.zoom is not None
-        assert params.shift is not None
-        self.clean_focal = self.focal * to_numpy(params.zoom[i])
-        self.clean_center = self.center + to_numpy(params.shift[i]) * width
-
-    def distorted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        r2 = x * x + y * y
-        g = 1 + sum(k * r2 ** (i + 1) for i, k in enumerate(self.k))
-        s1, s2, s3, s4 = self.s
-        return np.stack(
-            [
-                x * g + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x) + s1 * r2 + s2 * r2**2,
-                y * g + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y + s3 * r2 + s4 * r2**2,
-            ]
-        )
-
-    def magnitude(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Add the magnitudes of all terms, which the rounding error is proportional to."""
-        r = np.hypot(x, y)
-        decentering = sum(np.abs(v) for v in (*[self.p1] * 3, *[self.p2] * 3, self.s[0], self.s[2]))
-        return (
-            r * (1 + sum(abs(k) * r ** (2 * i + 2) for i, k in enumerate(self.k)))
-            + decentering * r**2
-            + (abs(self.s[1]) + abs(self.s[3])) * r**4
-        )
-
-    def jacobian(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Compute the Jacobian (2, 2, n) by central differences."""
-        h = 1e-6 * (1e-3 + np.hypot(x, y))
-        along = (self.distorted(x + h, y) - self.distorted(x - h, y)) / (2 * h)
-        down = (self.distorted(x, y + h) - self.distorted(x, y - h)) / (2 * h)
-        return np.stack([along, down], axis=1)
 
 
 @pytest.mark.parametrize("name", ["turbulence", "thin-plate spline", "divergence-free"])
@@ -101,7 +54,7 @@ def test_valid_flows_of_a_lens_follow_its_polynomial(data):
         assert not degraded.restore_flow.any()
         return
     for i in range(len(image)):
-        lens = Lens(degraded.params, i, *image.shape[2:])
+        lens = NumpyLens(degraded.params, i, *image.shape[2:])
         both = (degraded.flow, degraded.valid, False), (degraded.restore_flow, degraded.restore_valid, True)
         for flow, mask, is_restore in both:
             y, x = np.nonzero(mask[i, 0].numpy())
@@ -110,8 +63,8 @@ def test_valid_flows_of_a_lens_follow_its_polynomial(data):
             # The polynomial maps the clean pixel to the distorted one; the flow starts at the distorted one, the
             # restore flow at the clean one.
             clean, distorted = (pixel, pixel + shift) if is_restore else (pixel + shift, pixel)
-            ray = (clean - lens.clean_center[:, None]) / lens.clean_focal[:, None]
-            error = lens.distorted(*ray) * lens.focal[:, None] + lens.center[:, None] - distorted
+            ray = (clean - lens.clean_center) / lens.clean_focal
+            error = lens.distorted(*ray) * lens.focal + lens.center - distorted
             jacobian = lens.jacobian(*ray)
             determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
             rounding = 1e-5 * (lens.focal.max() * lens.magnitude(*ray) + np.abs(pixel).max(initial=1.0))

@@ -1,5 +1,4 @@
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -73,8 +72,7 @@ def test_the_divergence_of_the_matched_stencil_vanishes(kind, dtype, atol, oracl
     assert other.abs().max() > 0.1 * largest
 
 
-@pytest.mark.parametrize("kind", COVARIANCES)
-@pytest.mark.parametrize("length", [1.0, 12.0])
+@pytest.mark.parametrize(("kind", "length"), [*zip(COVARIANCES, (1.0, 12.0) * 2, strict=True)])
 def test_the_rms_of_the_flow_is_the_theoretical_one(kind, length):
     flow = curl(stream_functions(kind, length, samples=24, height=202, width=212))
     expected = curl_rms(torch.tensor([length], dtype=torch.float64), kind)
@@ -93,13 +91,6 @@ def test_flows_of_low_frequencies_at_nodes_are_those_at_the_pixels(stride):
     nodes, _ = divergence_free_flow(params, amplitude, lattice=lattice, **options)
     inside = nodes[:, :, 2 : 2 + len(range(0, 60, stride)), 2 : 2 + len(range(0, 80, stride))]
     assert_close(inside, dense[:, :, ::stride, ::stride], rtol=0, atol=1e-10)
-
-
-@pytest.mark.quick
-@pytest.mark.parametrize("field", [curl, lambda psi: curl(psi.square())])
-def test_gradients_of_the_curl_match_finite_differences(field: Callable[[Tensor], Tensor]):
-    psi = torch.randn(2, 1, 5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert torch.autograd.gradcheck(field, [psi.requires_grad_()])
 
 
 @pytest.mark.quick

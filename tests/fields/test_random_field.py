@@ -179,9 +179,9 @@ def test_the_edges_of_a_frame_as_large_as_the_cap_do_not_join():
 
 # Lags, px, at which the number of independent pieces of 48 fields allows for 3 % (three standard deviations or more).
 @pytest.mark.parametrize(
-    ("length", "frame", "lags"), [(1.0, (127, 160), (1, 2, 3)), (20.0, (480, 640), (1, 5, 10, 20))]
+    ("kind", "length", "frame", "lags"),
+    [("exponential", 1.0, (127, 160), (1, 2, 3)), ("matern32", 20.0, (480, 640), (1, 5, 10, 20))],
 )
-@pytest.mark.parametrize("kind", COVARIANCES)
 def test_the_variogram_of_samples_is_the_theoretical_one(kind, length, frame, lags, oracle):
     values = fields(24, *frame, length=length, kind=kind).double()
     assert values.square().mean() == pytest.approx(1, rel=0.03)

@@ -129,13 +129,6 @@ def test_boxes_below_the_limits_are_not_kept():
         assert warp_boxes(boxes, flow, **options)[1].tolist() == expected, limits
 
 
-def test_gradients_of_boxes_match_finite_differences(pixels, waves):
-    flow = (waves(*pixels(12, 14), 0.3, 3.0)).requires_grad_()
-    boxes = torch.tensor([[[2.3, 3.6, 7.45, 8.7], [-1.8, 2.2, 3.9, 20.3]]], dtype=torch.float64, requires_grad=True)
-    call = lambda b, f: warp_boxes(b, f, samples=5)[0]  # noqa: E731
-    assert torch.autograd.gradcheck(call, [boxes, flow], fast_mode=True)
-
-
 def test_a_batch_of_boxes_equals_its_samples(pixels, waves, random_boxes):
     flow = torch.cat([waves(*pixels(*SIZE), 8.0, 40.0), torch.full((1, 2, *SIZE), 3.0)]).float()
     boxes = random_boxes(2 * 5).float().view(2, 5, 4)

@@ -54,12 +54,6 @@ def test_soft_masks_interpolate_and_are_filled_outside():
     assert warp_mask(mask, flow).flatten().tolist() == [1.0, 0.0, 0.5, 0.0]
 
 
-def test_gradients_of_soft_masks_match_finite_differences(pixels, waves):
-    flow = (waves(*pixels(5, 6), 0.3, 2.0) + 0.31).requires_grad_()
-    mask = torch.rand(1, 1, 5, 6, generator=generator(), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda m, f: warp_mask(m, f, soft=True), [mask, flow], fast_mode=True)
-
-
 def test_depth_is_not_mixed_across_an_edge_by_default(pixels, waves):
     depth = torch.where(torch.arange(SIZE[1]) < 70, 5.0, 80.0).expand(1, 1, *SIZE).contiguous()
     flow = waves(*pixels(*SIZE), 9.0, 30.0).float()
@@ -161,16 +155,6 @@ def test_invalid_pixels_of_both_flows_are_filled(value):
     assert not valid[0, 0, 5, 0]
     assert torch.equal(warped == -9, ~valid.expand_as(warped))
     assert valid.sum() >= 48 - 1 - 4
-
-
-def test_gradients_of_optical_flow_match_finite_differences(pixels, waves):
-    flow, restore_flow = ((waves(*pixels(5, 6), 0.3, 2.0, phase) + 0.31).requires_grad_() for phase in (0.3, 0.7))
-    motion = (0.1 * torch.rand(1, 2, 5, 6, generator=generator(), dtype=torch.float64)).requires_grad_()
-
-    def warped(m: torch.Tensor, f: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
-        return warp_optical_flow(m, f, r, interpolation="bilinear")[0]
-
-    assert torch.autograd.gradcheck(warped, [motion, flow, restore_flow], fast_mode=True)
 
 
 @pytest.mark.parametrize(

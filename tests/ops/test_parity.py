@@ -45,8 +45,10 @@ def assert_agree(result: Tensor, image: Tensor, reference: Tensor) -> None:
 def test_numba_agrees_with_torch_along_dense_flows(size, padding):
     image, flow = random_image(2, 3, *size), random_flow(2, 2, *size)
     options = {"padding": padding, "interpolation": "bilinear"}
-    reference = sample(image.double(), flow, backend="torch", **options)
-    assert_agree(sample(image, flow, backend="numba", **options), image, reference)
+    for still in (0, size[0] // 3):  # rows that do not move
+        flow[:, :, :still] = 0
+        reference = sample(image.double(), flow, backend="torch", **options)
+        assert_agree(sample(image, flow, backend="numba", **options), image, reference)
 
 
 @needs_numba
@@ -66,6 +68,7 @@ def test_numba_agrees_with_torch_along_flows_on_lattices(stride, padding):
 @pytest.mark.parametrize("channels", [1, 3, 4, 7])
 def test_numba_reads_images_of_any_layout(dtype, channels):
     image, flow = random_image(1, channels, 60, 50, dtype=dtype), random_flow(1, 2, 60, 50)
+    flow[:, :, 20:30] = 0
     options: dict[str, Any] = {"padding": "border", "interpolation": "bilinear"}
     reference = sample(image, flow, backend="torch", **options)
     interleaved = image[0].movedim(0, -1).contiguous().movedim(-1, 0)[None]
@@ -84,6 +87,7 @@ def test_numba_reads_images_of_any_layout(dtype, channels):
 @pytest.mark.parametrize("padding", PADDINGS)
 def test_numba_reads_invalid_flow_as_torch_does(poison, padding):
     image, flow = random_image(1, 2, 40, 50), random_flow(1, 2, 40, 50)
+    flow[:, :, 4] = 0
     flow[0, 0, 4, 5] = flow[0, 1, 20, 30] = poison
     options = {"padding": padding, "interpolation": "bilinear"}
     reference = sample(image.double(), flow, backend="torch", **options)

@@ -142,41 +142,13 @@ def test_vmap_and_compiled_graphs_give_the_same_inverse(pixels, waves, way):
             lambda sample: tuple(value[0] for value in invert_flow(sample[None], steps=4))
         )(flow)
     else:
-        result, result_valid, _ = torch.compile(invert_flow, fullgraph=True, backend="aot_eager")(flow, steps=4)
+        result, result_valid, _ = torch.compile(invert_flow, fullgraph=True, backend="eager")(flow, steps=4)
     both = valid & result_valid
     # The last flow folds, and either solver may find another solution there.
     assert torch.equal(valid[:2], result_valid[:2])
     assert both.sum() > 0.99 * valid.sum()
     # A residual of 1/1000 px at most in either, which a slope of 1/4 along an axis passes on by a third more.
     assert (result - expected).norm(dim=1, keepdim=True)[:2][both[:2]].max() <= 2 * 1e-3 / (1 - 0.25)
-
-
-def test_a_sample_does_not_depend_on_its_batch(pixels, waves):
-    flow = torch.cat([waves(*pixels(48, 64), amplitude_px, 12.0) for amplitude_px in (0.5, 3.0, 8.0)]).float()
-    together = invert_flow(flow)
-    for i, sample in enumerate(flow.split(1)):
-        for value, alone in zip(together, invert_flow(sample), strict=True):
-            assert torch.equal(value[i : i + 1], alone)
-
-
-def test_gradients_through_a_curved_flow_are_those_of_finite_differences(pixels, waves):
-    x, y = pixels(5, 6)
-    flow = (waves(x, y, 0.3, 2.0) + 0.4).requires_grad_()
-    assert torch.autograd.gradcheck(lambda f: invert_flow(f, steps=60)[0][..., 2:-1, 2:-1], [flow])
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1)])
-def test_zero_flows_of_tiny_frames_are_their_own_inverse(size):
-    flow = torch.zeros(2, 2, *size)
-    inverse, valid, residual = invert_flow(flow)
-    assert torch.equal(inverse, flow)
-    assert valid.all()
-    assert not residual.any()
-
-
-def test_an_empty_batch_stays_empty():
-    inverse, valid, residual = invert_flow(torch.zeros(0, 2, 5, 6))
-    assert [t.shape for t in (inverse, valid, residual)] == [(0, 2, 5, 6), (0, 1, 5, 6), (0, 1, 5, 6)]
 
 
 @pytest.mark.parametrize(

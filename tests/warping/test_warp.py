@@ -190,12 +190,6 @@ def test_each_channel_and_sample_is_warped_alone(shape, interpolation):
         assert torch.equal(mask[0], valid[i])
 
 
-@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
-def test_an_empty_batch_stays_empty(interpolation):
-    warped, valid = warp(torch.zeros(0, 3, 5, 7), torch.zeros(0, 2, 5, 7), interpolation=interpolation)
-    assert (warped.shape, valid.shape, valid.dtype) == ((0, 3, 5, 7), (0, 1, 5, 7), torch.bool)
-
-
 def test_the_memory_format_is_kept_and_changes_no_value():
     image, flow = noise(2, 3, 12, 16).float(), random_flow(2, 12, 16).float()
     expected, _ = warp(image, flow)

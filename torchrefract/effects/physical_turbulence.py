@@ -94,7 +94,8 @@ class PhysicalTurbulence(WarpEffect):
         wind_x_range, wind_y_range: m/s, to the right and down.
         fps: frames per second of clips.
         reach: m, of the air. Farther pixels look through as much air as those at the reach.
-        num_layers: 3 to 8.
+        num_layers: 3 to 8. The correlation of pixels at the reach and beyond it does not depend on their number; more
+            layers divide the air in front of nearer things more finely.
         depth: of frames without a depth map, a provider or a function from images to their depth; None is a flat road
             below the horizon, seen from the height, or from 1.3 m.
         padding, interpolation, backend, tolerance_px, p: as for every warp. Each pixel has a ray of its own, so the
@@ -124,7 +125,7 @@ class PhysicalTurbulence(WarpEffect):
         wind_y_range: Range = (-1.0, 0.0),
         fps: float = 30.0,
         reach: float = 1000.0,
-        num_layers: int = 4,
+        num_layers: int = 3,
         depth: DepthSource | None = None,
         padding: str = "reflection",
         interpolation: str = "bilinear",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from torchrefract.types import Degraded
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.warp import sees_only_valid
+
+_T = TypeVar("_T")
 
 # How photometric maps of several effects combine.
 _COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
@@ -71,7 +73,7 @@ class Progress:
     def __init__(self, image: Tensor, depth: Tensor | None, batch: int):
         self.image, self.depth = image, depth
         self._frame = image  # before the photometric effects since the latest warp
-        self._assumed: list[tuple[DepthSource, Tensor]] = []
+        self._assumed: list[tuple[DepthSource, Callable[[], Tensor]]] = []
         self.frames = image.shape[0] // max(batch, 1)
         self.has_warps = False
         self.segments: list[_Segment] = []
@@ -99,7 +101,12 @@ class Progress:
         """
         height, width = self.image.shape[2:]
         segment = _segment(leaves, active, parts)
-        self.depth = self._sample_depth(segment)
+        if self.depth is not None:
+            self.depth = self._moved_depth(self.depth, segment)
+        self._assumed = [
+            (source, _remember(lambda depth=depth: self._moved_depth(depth(), segment)))
+            for source, depth in self._assumed
+        ]
         segments = [segment] if len(exposures) == 1 else [_segment(leaves, active, each) for each in exposures]
 
         def sampled(image: Tensor, k: int) -> Tensor:
@@ -107,7 +114,6 @@ class Progress:
 
         applied = _Applied(segment.applied, segment.flow.parts[0].flow.nodes)
         self._frame = self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
-        self._assumed = []
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
             warp = cast(WarpEffect, leaf.effect)
@@ -119,20 +125,21 @@ class Progress:
     def depth_for(self, effect: Effect) -> Tensor | None:
         """Return the depth that was passed in, or what a function of the effect gives, once for all that share it.
 
-        Fog changes no distance, so the function sees the frame before it.
+        Fog changes no distance, so the function sees the frame before it. Warps move what it gave.
         """
         source = effect.depth
         if self.depth is not None or source is None or isinstance(source, DepthProvider):
             return self.depth
         for function, depth in self._assumed:
             if function is source:
-                return depth
-        self._assumed.append((source, depth_of(source, self._frame, field_dtype(self._frame.dtype))))
-        return self._assumed[-1][1]
+                return depth()
+        depth = depth_of(source, self._frame, field_dtype(self._frame.dtype))
+        self._assumed.append((source, lambda: depth))
+        return depth
 
     def moved_depth(self, leaves: Sequence[Leaf], active: Sequence[Tensor], parts: Sequence[FlowPart]) -> Tensor | None:
         """Return the depth after warps that are not sampled yet; arguments as for `move`."""
-        return self._sample_depth(_segment(leaves, active, parts))
+        return None if self.depth is None else self._moved_depth(self.depth, _segment(leaves, active, parts))
 
     def shade(self, effect: PhotometricEffect, params: Any) -> None:
         """Apply a photometric effect."""
@@ -176,10 +183,8 @@ class Progress:
             light=self.light,
         )
 
-    def _sample_depth(self, segment: _Segment) -> Tensor | None:
-        if self.depth is None:
-            return None
-        depth, detached = expand_batch(self.depth, len(self.image)), segment._replace(flow=segment.flow.detach())
+    def _moved_depth(self, depth: Tensor, segment: _Segment) -> Tensor:
+        depth, detached = expand_batch(depth, len(self.image)), segment._replace(flow=segment.flow.detach())
         return detached.sample(depth, SamplingOptions("border", "nearest", "auto"))
 
     def _flow(self) -> Tensor:
@@ -222,16 +227,16 @@ class Progress:
         return total, valid
 
 
-def _remember(compute: Callable[[], BatchFlow]) -> Callable[[], BatchFlow]:
-    """Compute a flow when it is first needed, and keep it."""
-    computed: list[BatchFlow] = []
+def _remember(compute: Callable[[], _T]) -> Callable[[], _T]:
+    """Compute a value when it is first needed, and keep it."""
+    computed: list[_T] = []
 
-    def flow() -> BatchFlow:
+    def value() -> _T:
         if not computed:
             computed.append(compute())
         return computed[0]
 
-    return flow
+    return value
 
 
 def _valid_after(

@@ -18,7 +18,7 @@ from torchrefract.fields.depth import DepthSource, check_depth_provider, frame_d
 from torchrefract.fields.exposure import finite_image
 from torchrefract.fields.physical_turbulence import GREEN, fried_parameter, height_gain, height_gains
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
-from torchrefract.fields.turbulence_blur import View, blur_by_distance, halo_px, largest_change, num_distances
+from torchrefract.fields.turbulence_blur import View, blur_by_distance, distances_for, halo_px, largest_change
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_turbulence_blur
 from torchrefract.types import Range
 
@@ -177,7 +177,7 @@ class TurbulenceBlur(PhotometricEffect):
             light,
             expand_batch(strength, len(image)),
             view,
-            count=num_distances(largest, view),
+            distances=distances_for(largest, view),
             halo=halo_px(largest, view),
         )
         return Rendered(linear_to_srgb(blurred.clamp(0, 1)), is_valid)

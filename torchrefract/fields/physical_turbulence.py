@@ -6,7 +6,8 @@ The variance of the angle of arrival of a point at the distance L, along each ax
     Phi = 0.033 (k^2 + k0^2)^(-11/6) exp(-(k / km)^2),  k0 = 2 pi / L0,  km = 5.92 / l0,  A(u) = (2 J1(u/2) / (u/2))^2
 
 for an aperture D, an inner scale l0 and an outer scale L0, in m. No wavelength counts. Layers are the gradients of
-potentials, so the field of each has no curl; depth changes their weights alone.
+potentials, so the field of each has no curl; depth changes their weights alone. The spectrum of a layer is the integral
+over all air in it, so a few layers have the correlations of the whole path.
 
 Source: Tatarskii, "Wave propagation in a turbulent medium" (1961); Andrews and Phillips, "Laser beam propagation
 through random media" (2005), section 6.5; Wyngaard, Izumi, Collins, "Behavior of the refractive-index-structure
@@ -15,6 +16,7 @@ parameter near the ground", JOSA 61 (1971), for the decrease with height.
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -25,18 +27,19 @@ from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, cached, exact_matmul, shareable
 from torchrefract._validation import why_not_eager
-from torchrefract.fields.random_field import fast_size
+from torchrefract.fields.random_field import fast_size, periodic_part
 from torchrefract.random import white_noise
 
 GREEN = 550e-9  # m, wavelength of the light that counts most
 
-_RATIO = 3.0  # of the far ends of successive layers
+_RATIO = 5.0  # of the far ends of successive layers
 _HEIGHT_EXPONENT = -4 / 3  # of Cn2, by day
 _NEAREST = 1e-3  # of the reach
 _SMALLEST_DOMAIN = 8  # px; smaller ones have hardly any frequency that has a derivative
 # Clamps, since torch.where takes several times as long; the third power of the first one is a normal float32.
 _SMALLEST_BASE, _SMALLEST_SQUARE = 2.0**-40, 2.0**-66
 _NUM_GAINS = 513  # nodes of the table of gains
+_NUM_DENSITIES = 1025  # nodes of the table of densities, over more than twenty e-foldings
 _SUBCELLS = (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))  # Gauss-Legendre, of a cell
 
 
@@ -48,13 +51,13 @@ class Air(NamedTuple):
     outer_scale: float
 
 
-class Layers(NamedTuple):
+@dataclass(frozen=True)
+class Layers:
     """Layers of air, from the camera to the reach; layer k lies between edges k and k + 1.
 
     edges: m, the first one is 0 and the last one the reach.
-    distances: m, of the potential that stands for each layer.
-    apertures: m, the mean width that the light of a point at the reach has there.
-    strengths: rad^2/m, int kx^2 Phi A d^2k of each layer, for Cn2 = 1.
+    distances: m, the mean one of each layer, at which the wind moves it.
+    densities: of each layer, the table of `_densities`.
     air: aperture and scales.
     exponent: m in [8/3, 3]: a stretch of air at s adds to the variance of a path of length L as (1 - s/L)^(m - 1).
     gains: the table of `height_gain`.
@@ -62,8 +65,7 @@ class Layers(NamedTuple):
 
     edges: tuple[float, ...]
     distances: tuple[float, ...]
-    apertures: tuple[float, ...]
-    strengths: tuple[float, ...]
+    densities: tuple[tuple[float, ...], ...]
     air: Air
     exponent: float
     gains: tuple[float, ...]
@@ -101,19 +103,18 @@ def fried_parameter(cn2: float, distance: float, *, wavelength: float = GREEN) -
     return strength**-0.6 if strength > 0 else math.inf
 
 
+@lru_cache(maxsize=64)
 def layers_of(reach: float, count: int, air: Air) -> Layers:
     """Divide the path up to a reach, m, into layers whose far ends form a geometric series."""
     exponent = _exponent(air)
     edges = (0.0, *(reach * _RATIO ** (k - count + 1) for k in range(count)))
-    distances, apertures = [], []
+    distances, densities = [], []
     for start, end in pairwise(edges):
         s = start + (end - start) * (np.arange(1000) + 0.5) / 1000
-        weight = (1 - s / reach) ** (exponent - 1)
         # The correlation is nearly linear in the cubic root of the distance.
-        distances.append(float(np.average(np.cbrt(s), weights=weight) ** 3))
-        apertures.append(float(air.aperture * (1 - np.average(s, weights=weight) / reach)))
-    strengths = [_strength(air._replace(aperture=aperture)) for aperture in apertures]
-    return Layers(edges, tuple(distances), tuple(apertures), tuple(strengths), air, exponent, height_gains(exponent))
+        distances.append(float(np.average(np.cbrt(s), weights=(1 - s / reach) ** (exponent - 1)) ** 3))
+        densities.append(_densities(start, end, reach, air))
+    return Layers(edges, tuple(distances), tuple(densities), air, exponent, height_gains(exponent))
 
 
 def layer_shares(depth: Tensor, layers: Layers) -> list[Tensor]:
@@ -148,11 +149,7 @@ def height_gain(end_height: Tensor, gains: Sequence[float]) -> Tensor:
     """
     table = as_device_tensor(gains, dtype=end_height.dtype, device=end_height.device)
     # The gain is smooth in 1 / (1 + e^(1/3)).
-    place = (_NUM_GAINS - 1) / (1 + _power(end_height, 1 / 3))
-    low = place.detach().floor().clamp(0, _NUM_GAINS - 2)
-    index = low.long().flatten()
-    near, far = (table.index_select(0, index + step).view_as(place) for step in (0, 1))
-    return near + (far - near) * (place - low)
+    return _interpolate(table, (_NUM_GAINS - 1) / (1 + _power(end_height, 1 / 3)))
 
 
 def layer_gradients(
@@ -185,18 +182,15 @@ def layer_gradients(
         For each layer two tensors (N, 1, n, m), along x and along y.
     """
     options = {"focal": focal, "size": size, "rows": rows, "columns": columns, "dtype": dtype}
-    for k, (distance, strength) in enumerate(zip(layers.distances, layers.strengths, strict=True)):
-        air, moved = layers.air._replace(aperture=layers.apertures[k]), shift if shift is None else shift / distance
-        yield _layer_gradient(key, k, distance, air, strength, moved=moved, **options)
+    for k, distance in enumerate(layers.distances):
+        yield _layer_gradient(key, layers, k, moved=shift if shift is None else shift / distance, **options)
 
 
 @shareable
 def _layer_gradient(
     key: Tensor,
+    layers: Layers,
     k: int,
-    distance: float,
-    air: Air,
-    strength: float,
     *,
     moved: Tensor | None,
     focal: tuple[float, float],
@@ -211,7 +205,7 @@ def _layer_gradient(
     noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
     # A FakeTensor cannot be mixed with cached values.
     amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
-    amplitude, uniform = amplitudes(distance, air, strength, focal, size, dtype, key.device)
+    amplitude, uniform = amplitudes(layers, k, focal, size, dtype, key.device)
     values = noise * amplitude
     if moved is not None:
         values = _moved(values, moved, focal, size)
@@ -232,21 +226,11 @@ def _spectrum(k: Tensor, air: Air) -> Tensor:
     return 0.033 * k.square() * (k.square() + k0 * k0) ** (-11 / 6) * torch.exp(-(k / km).square()) * seen
 
 
-def _integral(air: Air, highest: Tensor) -> Tensor:
-    """Return int kx^2 Phi A d^2k = pi int k (k^2 Phi A) dk up to wave numbers, 1/m, (n,), float64."""
-    lowest = 1e-5 * 2 * math.pi / air.outer_scale
-    steps = torch.linspace(0, 1, 4097, dtype=torch.float64, device=highest.device)
-    k = lowest * (highest[:, None] / lowest) ** steps
-    logs = (highest / lowest).log() / 4096
-    values = k.square() * _spectrum(k, air)
-    return math.pi * logs * (values.sum(dim=1) - (values[:, 0] + values[:, -1]) / 2)
-
-
 @lru_cache(maxsize=4096)
 def _strength(air: Air) -> float:
-    """Return int kx^2 Phi A d^2k, rad^2/m, for Cn2 = 1."""
-    highest = torch.tensor([5 * 5.92 / air.inner_scale], dtype=torch.float64, device="cpu")
-    return _integral(air, highest).item()
+    """Return int kx^2 Phi A d^2k = pi int k (k^2 Phi A) dk, rad^2/m, for Cn2 = 1."""
+    k = _wave_numbers(1.0, air)
+    return _variance_up_to(k, _spectrum(k, air))[-1].item()
 
 
 @lru_cache(maxsize=64)
@@ -256,6 +240,46 @@ def _exponent(air: Air) -> float:
     x, weight = (x + 1) / 2, weight / 2
     values = [_strength(air._replace(aperture=air.aperture * share)) for share in x.tolist()]
     return _strength(air) / float(weight @ (x * x * np.array(values)))
+
+
+def _densities(start: float, end: float, reach: float, air: Air) -> tuple[float, ...]:
+    """Return p of a layer at angular wave numbers q, 1/rad, at equal steps of ln q from 1e-6 k0 end to 5 km end.
+
+        p(q) = c int ds (1 - s/R)^2 (k^2 Phi A)(q / s) / s^2 between its edges,  pi int q p(q) dq = 1
+
+    That is the variance along one axis; A is that of the width D (1 - s/R) which the light of the reach R has at s.
+    """
+    y, weight = np.polynomial.legendre.leggauss(24)
+    near, far = np.cbrt([start, end])
+    root = near + (far - near) * (y + 1) / 2  # the correlation is nearly linear in it
+    q = _wave_numbers(end, air)
+    density = torch.zeros_like(q)
+    for s, w in zip((root**3).tolist(), (weight * root**2).tolist(), strict=True):
+        width = 1 - s / reach
+        density += w * (width / s) ** 2 * _spectrum(q / s, air._replace(aperture=air.aperture * width))
+    return tuple((density / _variance_up_to(q, density)[-1]).tolist())
+
+
+def _wave_numbers(end: float, air: Air, device: torch.device | None = None) -> Tensor:
+    """Return q of the table of densities of a layer up to a distance, 1/rad, float64."""
+    low, high = 1e-6 * 2 * math.pi / air.outer_scale * end, 5 * 5.92 / air.inner_scale * end
+    exponents = torch.linspace(0, 1, _NUM_DENSITIES, dtype=torch.float64, device=device or torch.device("cpu"))
+    return low * (high / low) ** exponents
+
+
+def _variance_up_to(q: Tensor, density: Tensor) -> Tensor:
+    """Return pi int q p dq up to each of the wave numbers, by trapezoids over their logarithms."""
+    values = math.pi * q.square() * density
+    steps = (q[1:] / q[:-1]).log() * (values[1:] + values[:-1]) / 2
+    return torch.cat([torch.zeros_like(q[:1]), steps.cumsum(dim=0)])
+
+
+def _interpolate(table: Tensor, place: Tensor) -> Tensor:
+    """Interpolate a table linearly at fractional indices of any shape."""
+    low = place.detach().floor().clamp(0, len(table) - 2)
+    index = low.long().flatten()
+    near, far = (table.index_select(0, index + step).view_as(place) for step in (0, 1))
+    return near + (far - near) * (place - low)
 
 
 @lru_cache(maxsize=64)
@@ -268,7 +292,7 @@ def height_gains(exponent: float) -> tuple[float, ...]:
     # The integrand is smooth in the cubic root of the distance to the lower end of the ray.
     x = np.where(e < 1, y**3, 1 - y**3)
     values = (exponent * x ** (exponent - 1) * (e + (1 - e) * x) ** _HEIGHT_EXPONENT * 3 * y * y) @ weight
-    return np.where(z > 0, np.sqrt(values), 0.0).tolist()
+    return tuple(np.where(z > 0, np.sqrt(values), 0.0).tolist())
 
 
 def _frequencies(focal: tuple[float, float], size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -281,9 +305,8 @@ def _frequencies(focal: tuple[float, float], size: tuple[int, int], device: torc
 
 
 def _amplitudes(
-    distance: float,
-    air: Air,
-    strength: float,
+    layers: Layers,
+    k: int,
     focal: tuple[float, float],
     size: tuple[int, int],
     dtype: torch.dtype,
@@ -291,18 +314,25 @@ def _amplitudes(
 ) -> tuple[Tensor, Tensor]:
     """Return the factors of the noise, for the potential, (Ht, Wt / 2 + 1), and for the uniform tilt, (2, 1, 1)."""
     qy, qx = _frequencies(focal, size, device)
-    cell_y, cell_x = (2 * math.pi * f / n / distance for f, n in zip(focal[::-1], size, strict=True))
+    cell_y, cell_x = (2 * math.pi * f / n for f, n in zip(focal[::-1], size, strict=True))
+    table_q = _wave_numbers(layers.edges[k + 1], layers.air, device)
+    density = as_device_tensor(layers.densities[k], dtype=torch.float64, device=device)
+
+    def at(table: Tensor, q: Tensor) -> Tensor:
+        place = (q / table_q[0]).log() / (table_q[1] / table_q[0]).log()
+        return _interpolate(table, place.clamp(0, _NUM_DENSITIES - 1))
+
     power = torch.zeros(qy.shape[0], qx.shape[0], dtype=torch.float64, device=device)
     for dy in _SUBCELLS:  # the spectrum is steep at the lowest frequencies
         for dx in _SUBCELLS:
-            power = power + _spectrum(torch.hypot(qy / distance + dy * cell_y, qx / distance + dx * cell_x), air) / 4
-    power = power * (cell_x * cell_y / strength)
+            power = power + at(density, torch.hypot(qy + dy * cell_y, qx + dx * cell_x)) / 4
+    power = power * (cell_x * cell_y)
     # The highest frequency of an even size has no derivative, and that of 0 is the uniform tilt.
     ky, kx = (torch.arange(n, device=device) for n in power.shape)
     is_used = (ky[:, None] != size[0] // 2) & (kx != size[1] // 2) & ((ky[:, None] != 0) | (kx != 0))
     times = (2 - (kx == 0).to(power.dtype)) * is_used  # how often a frequency of the half occurs among all
     radius = torch.full((1,), math.sqrt(cell_x * cell_y / math.pi), dtype=torch.float64, device=device)
-    uniform = (_integral(air, radius)[0] / strength).clamp(max=1)
+    uniform = at(_variance_up_to(table_q, density), radius)[0].clamp(max=1)
     missing = (1 - uniform - (power * times).sum() / 2).clamp(min=0)
     power = (power + 2 * missing / times.sum()) * is_used
     power = power * ((1 - uniform) / ((power * times).sum() / 2))
@@ -357,22 +387,13 @@ def _gradient(
             for q, offset in zip((qx, qy), offsets, strict=True)
         ]
     spectrum = torch.complex(real, imaginary)
-    along_x = _part(torch.fft.ifft(spectrum, dim=2, norm="forward"), 2, rows) * qx
-    along_y = _part(torch.fft.ifft(spectrum * qy, dim=2, norm="forward"), 2, rows)
+    along_x = periodic_part(torch.fft.ifft(spectrum, dim=2, norm="forward"), 2, rows) * qx
+    along_y = periodic_part(torch.fft.ifft(spectrum * qy, dim=2, norm="forward"), 2, rows)
     gradient = []
     for lines, offset in zip((along_x, along_y), offsets, strict=True):
         lines.narrow(3, 0, 1).add_(offset)  # kx = 0 is what all pixels of a row share
-        gradient.append(_part(torch.fft.irfft(lines, n=size[1], dim=3, norm="forward"), 3, columns))
+        gradient.append(periodic_part(torch.fft.irfft(lines, n=size[1], dim=3, norm="forward"), 3, columns))
     return gradient
-
-
-def _part(values: Tensor, dim: int, span: range) -> Tensor:
-    """Return some positions of a periodic dimension."""
-    size = values.shape[dim]
-    if span.step == 1 and span.start >= 0 and span.stop <= size:  # far faster than by index
-        return values.narrow(dim, span.start, len(span))
-    index = torch.arange(span.start, span.stop, span.step, device=values.device)
-    return values.index_select(dim, index.remainder(size))
 
 
 def _sum(real: Tensor, imaginary: Tensor, size: tuple[int, int], rows: range, columns: range) -> Tensor:

@@ -5,7 +5,6 @@ what remains blurs it.
 """
 
 import math
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -14,10 +13,9 @@ from torch import Tensor
 from torchrefract._tensor import cached_constant
 from torchrefract.fields.random_field import fast_size
 
-# Of the contrast, by the interpolation between distances; 2 % with what the bound by a chord omits.
-_ERROR = 0.0199
+_ERROR = 0.0199  # of the contrast, by the interpolation between distances; 2 % with what the grid below omits
+_GRID = 257  # shares of the largest strength, and of the largest exponent, at which that error is computed
 _HALO = 14.5  # widths lambda / r0 of the blur, beyond which it has 0.1 % of the light
-_BEND = 2 * (1 - 1 / math.e)  # of `_spacing` at 2
 _KERNEL_SIDE = 128  # px, of the kernel whose sum bounds the change of an image
 _TINY = 1e-30
 
@@ -54,16 +52,43 @@ def short_exposure_exponent(frequency: Tensor, view: View) -> Tensor:
     return 3.44 * (q ** (5 / 3) - q.square() / 2)
 
 
-def num_distances(strength: float, view: View) -> int:
-    """Return at how many distances `blur_by_distance` must blur, so that the contrast is off by at most 2 %.
+class Distances(NamedTuple):
+    """The distances at which a frame is blurred; all others are interpolated between these.
+
+        exp(-x u g) = sum_i exp(-rates_i u) sum_j weights_ij exp(-x places_j g)  for u and g in [0, 1], up to 2 %
+
+    It is exact for u in `places`, at n distances, and for n exponents, of which one is 0, as `rates` start with 0.
+    """
+
+    places: tuple[float, ...]  # (n,), shares of the largest strength, the first one 0
+    rates: tuple[float, ...]  # (n,)
+    weights: tuple[tuple[float, ...], ...]  # (n, n)
+
+
+@cached_constant(maxsize=64)
+def distances_for(strength: float, view: View) -> Distances:
+    """Return at how many distances `blur_by_distance` blurs, so that the contrast is off by at most 2 %, and at which.
+
+    Each is the one, with an exponent, where the interpolation between those before it is off the most.
 
     Args:
         strength: largest (D / r0)^(5/3) of a pixel.
         view: of the frame.
+
+    Source: Bebendorf, "Approximation of boundary element matrices", Numerische Mathematik 86 (2000), for the choice.
     """
-    spacing = _spacing(torch.tensor(strength * _largest_exponent(view), dtype=torch.float64, device="cpu"))
-    # The chord of exp(-g x) is off by spacing^2 / 8, and up to 0.5 % of that more for steps of this size.
-    return 1 + max(1, math.ceil(spacing.item() / math.sqrt(8 * _ERROR)))
+    largest = strength * _largest_exponent(view)
+    shares = torch.linspace(0, 1, _GRID, dtype=torch.float64, device="cpu").square()
+    error = torch.exp(-largest * shares[:, None] * shares)
+    chosen: list[tuple[int, int]] = []
+    while len(chosen) < 2 or error.abs().amax() > _ERROR:
+        place, exponent = divmod(int(error.abs().argmax()), _GRID)
+        chosen.append((place, exponent))
+        error = error - error[:, exponent, None] * error[place] / error[place, exponent]
+    places, exponents = (shares[list(index)] for index in zip(*chosen, strict=True))
+    weights = torch.linalg.inv(torch.exp(-largest * places[:, None] * exponents))
+    rates = (largest * exponents).tolist()
+    return Distances(tuple(places.tolist()), tuple(rates), tuple(map(tuple, weights.tolist())))
 
 
 def halo_px(strength: float, view: View) -> int:
@@ -79,17 +104,18 @@ def halo_px(strength: float, view: View) -> int:
     return math.ceil(min(_HALO * width, 1e9))
 
 
-def blur_by_distance(light: Tensor, strength: Tensor, view: View, *, count: int, halo: int) -> Tensor:
+def blur_by_distance(light: Tensor, strength: Tensor, view: View, *, distances: Distances, halo: int) -> Tensor:
     """Blur light, each pixel by a strength of its own.
 
-    The frame is blurred with `count` strengths from the lowest to the highest one, each by its transfer function, and
-    interpolated linearly between these. Light that would leave the frame is reflected at its border.
+    The strengths of the frame lie between the lowest one and the highest one, u in [0, 1] of the way. For each of the
+    rates the frame is blurred once by a transfer function. Their sum, each times exp(-rate u), is the result. Light
+    that would leave the frame is reflected at its border.
 
     Args:
         light: (N, C, H, W), linear, finite.
         strength: (N, 1, H or 1, W or 1), (D / r0)^(5/3), at least 0; it grows linearly with the distance.
         view: of the frame.
-        count: of strengths, at least 2, see `num_distances`.
+        distances: for the highest strength or a higher one, see `distances_for`.
         halo: px, how far the frame is continued, see `halo_px`; from half a side on all light stays in the frame.
 
     Returns:
@@ -100,19 +126,16 @@ def blur_by_distance(light: Tensor, strength: Tensor, view: View, *, count: int,
     rows, columns = (_reflected(size, to, light.device) for size, to in zip((height, width), sizes, strict=True))
     spectrum = torch.fft.rfft2(light.index_select(2, rows).index_select(3, columns))
     exponent = short_exposure_exponent(_frequencies(sizes, view.focal, light), view)
-
-    def in_frame(spectrum: Tensor) -> Tensor:
-        lines = torch.fft.ifft(spectrum, dim=2).narrow(2, 0, height)
-        return torch.fft.irfft(lines, n=sizes[1], dim=3).narrow(3, 0, width)
-
-    steps = _steps(strength.amin(dim=(1, 2, 3)), strength.amax(dim=(1, 2, 3)), count, _largest_exponent(view))
-    steps = [step.view(-1, 1, 1, 1) for step in steps]
-    passed = torch.exp(-steps[0] * exponent)
-    result = in_frame(spectrum * passed)
-    for low, high in pairwise(steps):
-        before, passed = passed, torch.exp(-high * exponent)
-        share = ((strength - low) / (high - low).clamp(min=_TINY)).clamp(0, 1)
-        result = torch.addcmul(result, share, in_frame(spectrum * (passed - before)))
+    low = strength.amin(dim=(1, 2, 3), keepdim=True)
+    span = strength.amax(dim=(1, 2, 3), keepdim=True) - low
+    share = ((strength - low) / span.clamp(min=_TINY)).clamp(0, 1)
+    passed = [torch.exp(-(low + place * span) * exponent) for place in distances.places]
+    result = torch.zeros((), dtype=light.dtype, device=light.device)
+    for rate, weights in zip(distances.rates, distances.weights, strict=True):
+        transfer = torch.stack([weight * value for weight, value in zip(weights, passed, strict=True)]).sum(dim=0)
+        lines = torch.fft.ifft(spectrum * transfer, dim=2).narrow(2, 0, height)
+        blurred = torch.fft.irfft(lines, n=sizes[1], dim=3).narrow(3, 0, width)
+        result = torch.addcmul(result, torch.exp(-rate * share), blurred)
     return result
 
 
@@ -135,27 +158,6 @@ def _largest_exponent(view: View) -> float:
     """Return the exponent at the highest frequency of the frame."""
     highest = torch.tensor([math.hypot(*view.focal) / 2], dtype=torch.float64, device="cpu")
     return short_exposure_exponent(highest, view).item()
-
-
-def _steps(low: Tensor, high: Tensor, count: int, largest: float) -> list[Tensor]:
-    """Return strengths from low to high, (N,), whose chords of exp(-strength g) are off alike for the worst g."""
-    start, end = _spacing(low * largest), _spacing(high * largest)
-    inner = [_from_spacing(torch.lerp(start, end, k / (count - 1))) / largest for k in range(1, count - 1)]
-    return [low, *inner, high]
-
-
-def _spacing(x: Tensor) -> Tensor:
-    """Return int_0^x max over g in [0, 1] of g exp(-g y / 2) dy.
-
-    2 (1 - exp(-x / 2)) up to x = 2, then 2 (1 - 1/e) + 2 ln(x / 2) / e
-    """
-    return -2 * torch.expm1(-x.clamp(max=2.0) / 2) + (x.clamp(min=2.0) / 2).log() * (2 / math.e)
-
-
-def _from_spacing(spacing: Tensor) -> Tensor:
-    """Return x for `_spacing`."""
-    low, high = spacing.clamp(max=_BEND), spacing.clamp(min=_BEND)
-    return -2 * torch.log1p(-low / 2) + 2 * torch.expm1((high - _BEND) * (math.e / 2))
 
 
 def _extended_size(size: int, halo: int) -> int:

@@ -199,14 +199,13 @@ def _sample_rows(
     below = strides[2] if height > 1 else 0
     for row in range(start, stop):
         sample, i = row // height, row % height
-        if not active[sample]:
+        sample_flow = flow[sample if flow.shape[0] > 1 else 0]
+        if not active[sample] or (lattice[0] == 0 and _is_still(sample_flow, i)):
             for channel in range(channels):
                 first = sample * strides[0] + channel * strides[1] + i * strides[2]
                 target = sample * out_strides[0] + channel * out_strides[1] + i * out_strides[2]
-                for j in range(width):
-                    out[target + j * out_strides[3]] = source[first + j * strides[3]]
+                _copy(source[first:], strides[3], out[target:], out_strides[3], width)
             continue
-        sample_flow = flow[sample if flow.shape[0] > 1 else 0]
         if lattice[0] > 0:
             _lattice_positions(sample_flow, i, lattice, table, line, x, y)
         else:
@@ -220,6 +219,23 @@ def _sample_rows(
             first = sample * strides[0] + channel * strides[1]
             target = sample * out_strides[0] + channel * out_strides[1] + i * out_strides[2]
             _gather(source[first:], offset, weight, right, below, rounding, out[target:], out_strides[3])
+
+
+@_jit
+def _copy(source, source_step, out, out_step, count):
+    """Copy a row."""
+    source_step, out_step = np.uintp(source_step), np.uintp(out_step)
+    for j in range(count):
+        out[np.uintp(j) * out_step] = source[np.uintp(j) * source_step]
+
+
+@_jit
+def _is_still(flow, i):
+    """Return True if row i of a dense flow moves no pixel."""
+    moves = False
+    for j in range(flow.shape[2]):
+        moves |= flow[0, i, j] != 0 or flow[1, i, j] != 0
+    return not moves
 
 
 @_jit

@@ -21,7 +21,7 @@ class Scenes(Dataset):
     """Rendered roads with the box of the road ahead."""
 
     def __init__(self, transform: v2.Transform):
-        self.frames, self.transform = RoadScenes(64, size=SIZE), transform
+        self.frames, self.transform = RoadScenes(8, size=SIZE), transform
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -49,7 +49,7 @@ def score(clean: Tensor, degraded: tr.Degraded) -> float:
     return (2 * recall * precision / (recall + precision).clamp(min=1e-6)).item()
 
 
-frames, depth = render_road_scenes(torch.arange(6), *SIZE)
+frames, depth = render_road_scenes(torch.arange(3), *SIZE)
 axes = (figure := Figure(figsize=(7, 4), dpi=120, layout="constrained")).subplots()
 for name, scene in SCENES.items():
     curve = [score(frames, scene(s).degrade(frames, seed=1, depth=depth)) for s in presets.SEVERITIES]

@@ -2,6 +2,7 @@ import gc
 import importlib
 import logging
 import math
+import multiprocessing
 import os
 import socket
 import subprocess
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +23,9 @@ from torchrefract.cameras.projection import undistort
 
 # Files of slow tests, the slowest first, which would leave one process of pytest-xdist alone if they ran last.
 SLOW_FILES = (
-    *("effects/test_contract.py", "test_train.py", "data/test_two_nodes.py", "data/pairs/test_runs.py"),
-    *("cli/test_preview.py", "effects/test_compose.py", "test_calibrate.py", "test_examples.py", "test_export.py"),
-    "benchmarks/test_table1.py",
+    *("effects/test_contract.py", "test_train.py", "effects/test_compose.py", "test_calibrate.py"),
+    *("cli/test_preview.py", "test_export.py", "test_examples.py", "test_package.py", "benchmarks/test_table1.py"),
+    "robustness/test_run_options.py",
 )
 
 
@@ -138,6 +140,26 @@ def empty_bucket(protocol: str, environment: dict[str, str]) -> Iterator[dict[st
         fsspec: Any = importlib.import_module("fsspec")
         fsspec.filesystem(protocol, use_listings_cache=False).mkdir("bucket")
         yield environment
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _equal_scenes_are_rendered_once() -> Iterator[None]:
+    """Keep small road scenes, of which the data sets of trainings render a few again and again."""
+    module = importlib.import_module("torchrefract.data.road_scenes.render")
+    render = module.render_road_scenes
+
+    @lru_cache
+    def kept(key: int, *size: int, seed: int) -> tuple[Tensor, Tensor]:
+        return render(torch.tensor([key]), *size, seed=seed)
+
+    def render_once(keys: Tensor, height: int, width: int, *, seed: int = 0) -> tuple[Tensor, ...]:
+        if len(keys) > 1 or height * width > 64 * 128:
+            return render(keys, height, width, seed=seed)
+        return tuple(value.clone() for value in kept(int(keys), height, width, seed=seed))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "render_road_scenes", render_once)
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -278,7 +300,7 @@ class Trained(NamedTuple):
 @pytest.fixture(scope="session")
 def small() -> tuple[str, ...]:
     """Return arguments of a training that takes seconds."""
-    data = ("data.train_count=16", "data.val_count=8", "data.batch_size=4", "data.size=[32,64]", "data.workers=0")
+    data = ("data.train_count=8", "data.val_count=4", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
     return (*data, "trainer.max_epochs=2", "model=resunet", "model.network.encoder=tu-test_resnet")
 
 
@@ -294,6 +316,32 @@ def spawn() -> Callable[..., Outcome]:
         return Outcome(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def fork() -> Callable[..., Any]:
+    """Return a function that starts a command in a process forked from this one, which has imported everything.
+
+    The process leads a group of its own, and uses one thread.
+    """
+
+    def start(name: str, *words: str, cwd: Path) -> Any:
+        def run() -> None:
+            server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]  # not in stubs
+            server._forkserver_pid = server._forkserver_alive_fd = (
+                None  # that of this process is no child of the new one
+            )
+            os.setsid()
+            os.chdir(cwd)
+            torch.set_num_threads(1)
+            sys.argv = [f"torchrefract.{name}", *words]
+            importlib.import_module(f"torchrefract.{name}").main()
+
+        process = multiprocessing.get_context("fork").Process(target=run)
+        process.start()
+        return process
+
+    return start
 
 
 @pytest.fixture(scope="session")

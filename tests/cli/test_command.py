@@ -263,7 +263,8 @@ def test_a_command_without_a_task_lists_the_tasks(call):
 
 
 def test_an_evaluation_without_a_checkpoint_names_the_option(call):
-    assert call("eval").message.startswith("ckpt_path must be the path of a checkpoint: add ckpt_path=")
+    message = "ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none"
+    assert call("eval").message == message
     assert call("eval", "ckpt_path=a=1.ckpt").message.endswith(
         "must be a checkpoint file, such as <run>/last.ckpt, got a=1.ckpt"
     )
@@ -309,9 +310,7 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
         ("+model.depth=3", "model: .*'depth'"),
         ("model.network.encoder=tu-nonsense", "model: encoder must be a name of .*, got tu-nonsense"),
         ("data.size=[64", r"\[64"),
-        ("data.size=[4,4]", "data: size must be at least 8, got 4"),
-        ("data.batch_size=17", "data: batch_size must be at most the 16 training frames, got 17"),
-        ("data.workers=-1", "data: workers must be at least 0, got -1"),
+        ("data.batch_size=9", "data: batch_size must be at most the 8 training frames, got 9"),
         ("trainer.max_epochs=-5", "trainer: .*max_epochs.*-5"),
         ("seed=-1", "seed.*-1"),
         ("seed=tomorrow", "seed.*tomorrow"),

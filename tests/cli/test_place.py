@@ -1,6 +1,7 @@
 """`camera=` and `horizon=` of commands."""
 
 import shutil
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchrefract.random import key_of
 COMMANDS = {
     "degrade": ("source=frames", "workers=0"),
     "generate": ("source=frames", "workers=0", "license=CC0"),
-    "preview": ("frames/a.png",),
+    "preview": ("frames/a.png", "frames=1"),
 }
 PLACE = ("camera=camera.yaml", "horizon=0.4")
 FOG = "scene=cape_town_fog"
@@ -51,31 +52,24 @@ def results(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_camera_and_horizon_reach_the_scene_of_each_command(call, folder, command):
-    out = ".png" if command == "preview" else ""
-    given = {
-        "both": PLACE,
-        "scene": [f"scene.{option}" for option in PLACE],
-        "camera": PLACE[:1],
-        "horizon": PLACE[1:],
-        "none": (),
-    }
+    suffix = ".apng" if command == "preview" else ""
+    given = {"both": PLACE, "scene": [f"scene.{option}" for option in PLACE], "none": ()}
+    if command == "preview":  # all commands share the code that gives them to the scene
+        given |= {"camera": PLACE[:1], "horizon": PLACE[1:]}
     for name, words in given.items():
-        outcome = call(command, *COMMANDS[command], FOG, *words, f"out={name}{out}")
+        outcome = call(command, *COMMANDS[command], FOG, *words, f"out={name}{suffix}")
         assert outcome.code == 0, outcome.err
-    made = {name: results(folder / f"{name}{out}") for name in given}
-    assert made["both"] == made["scene"]
-    names = ("both", "camera", "horizon", "none")
-    assert all(made[a] != made[b] for i, a in enumerate(names) for b in names[:i])
-    for words, message in {
+    made = {name: results(folder / f"{name}{suffix}") for name in given}
+    assert made.pop("both") == made["scene"]
+    assert all(made[a] != made[b] for a, b in combinations(made, 2))
+    errors = {
         ("camera=none.yaml",): "camera must name what exists, got none.yaml: No such file or directory",
         ("horizon=20",): "horizon must be a number in [-10, 10], got 20",
-        (
-            "camera=camera.yaml",
-            "scene=cheap_dashcam",
-        ): "camera must be given with a scene that takes it, got scene=chea",
-    }.items():
-        assert message in call(command, *COMMANDS[command], FOG, *words, f"out=bad{out}").message
-        assert not (folder / f"bad{out}").exists()
+        ("camera=camera.yaml", "scene=cheap_dashcam"): "camera must be given with a scene that takes it, got scene=che",
+    }
+    for words, message in errors.items():
+        assert message in call(command, *COMMANDS[command], FOG, *words, f"out=bad{suffix}").message
+        assert not (folder / f"bad{suffix}").exists()
 
 
 def test_a_picture_is_degraded_with_the_numbers_of_the_camera_file(call, folder):

@@ -1,6 +1,7 @@
 import errno
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import matplotlib.image
@@ -27,6 +28,7 @@ SHOWN = list(OmegaConf.load(Path(__file__).parents[2] / "conf" / "preview.yaml")
 LENS = ("scene=cheap_dashcam",)  # a lens with its defaults
 FOG = ("scene=cape_town_fog",)
 FLARE = ("scene=limpopo_sun_glare", "seed=3")
+STILL = ("out=still.apng", "frames=1")  # an animation of one frame, without the figure around it
 
 
 @pytest.fixture
@@ -83,15 +85,21 @@ def pictures_of(path: Path) -> list[np.ndarray]:
     return pictures
 
 
+def still(path: Path, effect: Effect, frame: torch.Tensor, **options: Any) -> bool:
+    """Return True if a single picture shows a frame (1, 3, 24, 32) that an effect has degraded."""
+    (shown,) = pictures_of(path)
+    return shows(shown, as_displayed(effect.degrade(frame, seed=0, **options).image[0]))
+
+
 def flare_at(frame: torch.Tensor, t: int) -> np.ndarray:
     """Return a frame (1, 3, 24, 32) with the scene's flare at time t as displayed, (240, 320, 3)."""
-    image = limpopo_sun_glare().degrade(frame, seed=3, frame=t).image[0]
-    return as_displayed(image)
+    return as_displayed(limpopo_sun_glare().degrade(frame, seed=3, frame=t).image[0])
 
 
-def as_displayed(image: torch.Tensor) -> np.ndarray:
+def as_displayed(image: torch.Tensor, *, factor: int = 10) -> np.ndarray:
     """Return (3, 24, 32) as an animation shows it, (240, 320, 3)."""
-    return (255 * image).round().byte().repeat_interleave(10, 1).repeat_interleave(10, 2).movedim(0, -1).numpy()
+    pixels = (255 * image).round().byte().movedim(0, -1).numpy()
+    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def write_video(path: Path, frames: list[torch.Tensor]) -> None:
@@ -115,6 +123,8 @@ def test_a_picture_becomes_a_contact_sheet(call, picture, tmp_path):
         assert sheet_shows(tmp_path / "preview.png", cell)
     other_seed = row_of(tr.LensDistortion(), read_image(picture)[None], seed=4)
     assert not sheet_shows(tmp_path / "preview.png", other_seed.corrupted)
+    assert call("preview", "frame.png", *LENS, "seed=3", "out=again.png").code == 0
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "preview.png").read_bytes()
 
 
 def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_path):
@@ -124,10 +134,9 @@ def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_p
 
 
 def test_a_guess_of_the_depth_is_said(call, picture):
-    assert (
-        "warning: HeterogeneousFog assumes the depth of a road between walls" in call("preview", "frame.png", *FOG).err
-    )
-    assert call("preview", *FOG, "size=[24,32]").err == ""  # a rendered scene has its own
+    warning = "warning: HeterogeneousFog assumes the depth of a road between walls"
+    assert warning in call("preview", "frame.png", *FOG, *STILL).err
+    assert call("preview", *FOG, *STILL, "size=[24,32]").err == ""  # a rendered scene has its own
 
 
 def test_fog_has_the_depth_of_the_rendered_scene(call, tmp_path):
@@ -141,32 +150,17 @@ def test_fog_has_the_depth_of_the_rendered_scene(call, tmp_path):
 def test_the_settings_of_an_effect_can_be_changed(call, picture, tmp_path):
     names = [name for name in SHOWN if name not in ("Turbulence", "UniformFog")]
     words = ["effects.Turbulence.amplitude_range=[1,1]", "effects.UniformFog.visibility_range=[9,9]"]
-    outcome = call("preview", "frame.png", *(f"~effects.{name}" for name in names), *words)
-    assert outcome.out == "preview.png: Turbulence, UniformFog on frame.png\n"
+    outcome = call("preview", "frame.png", *(f"~effects.{name}" for name in names), *words, *STILL)
+    assert outcome.out == "still.apng: Turbulence, UniformFog on frame.png, 1 frames\n"
     turbulence = tr.Turbulence(amplitude_range=(1, 1), length_range=(60, 90), aperture_range=(8, 10))
     for effect in (turbulence, tr.UniformFog(visibility_range=(9, 9), depth=tr.GroundPlaneDepth())):
-        assert sheet_shows(tmp_path / "preview.png", row_of(effect, read_image(picture)[None]).corrupted)
+        assert still(tmp_path / "still.apng", effect, read_image(picture)[None])
 
 
 def test_a_scene_takes_its_severity(call, picture, tmp_path):
-    assert call("preview", "frame.png", *FOG, "scene.severity=5").code == 0
-    thick, usual = (row_of(cape_town_fog(severity), read_image(picture)[None]) for severity in (5, 3))
-    assert sheet_shows(tmp_path / "preview.png", thick.corrupted)
-    assert not sheet_shows(tmp_path / "preview.png", usual.corrupted)
-
-
-def test_equal_seeds_give_equal_bytes(call, picture, tmp_path):
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert call("preview", "frame.png", *LENS, f"seed={seed}", f"out={name}.png").code == 0
-    first, second, other = ((tmp_path / f"{name}.png").read_bytes() for name in "abc")
-    assert first == second != other
-
-
-def test_a_picture_is_cropped_and_reduced_before_it_is_degraded(call, picture, tmp_path):
-    assert call("preview", "frame.png", *LENS, "size=[12,8]").code == 0
-    row = row_of(tr.LensDistortion(), read_image(picture)[None, :, ::2, 8:24:2].contiguous())
-    assert sheet_shows(tmp_path / "preview.png", row.frame)
-    assert sheet_shows(tmp_path / "preview.png", row.corrupted)
+    assert call("preview", "frame.png", *FOG, *STILL, "scene.severity=5").code == 0
+    assert still(tmp_path / "still.apng", cape_town_fog(5), read_image(picture)[None])
+    assert not still(tmp_path / "still.apng", cape_town_fog(), read_image(picture)[None])
 
 
 # --- arguments
@@ -184,13 +178,13 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_any_name_of_a_file_reaches_the_configuration_unchanged(tmp_path, monkeypatch, name):
+def test_any_name_of_a_picture_reaches_the_configuration_unchanged(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path(name).touch()
-    (word,) = prepare_arguments("preview", [name])
     with initialize_config_dir(CONFIG_DIR, version_base="1.3"):
-        assert compose("preview", overrides=[word]).image == name
+        for name in NAMES:
+            Path(name).touch()
+            (word,) = prepare_arguments("preview", [name])
+            assert compose("preview", overrides=[word]).image == name
 
 
 def test_a_picture_with_an_odd_name_is_drawn(call, picture, tmp_path):
@@ -282,30 +276,29 @@ def meters() -> np.ndarray:
     return depth
 
 
-def enlarged(depth: np.ndarray, factor: int) -> np.ndarray:
-    return depth.repeat(factor, axis=0).repeat(factor, axis=1)
+def tensor_of(depth: np.ndarray, *, factor: int = 2) -> torch.Tensor:
+    """Return depth (1, 1, H, W), enlarged."""
+    return torch.from_numpy(depth.repeat(factor, axis=0).repeat(factor, axis=1).astype(np.float32))[None, None]
 
 
 def test_a_depth_array_may_have_any_size_of_the_picture_s_shape(call, picture, tmp_path):
-    frame = read_image(picture)[None]
-    expected = row_of(cape_town_fog(), frame, depth=enlarged(meters(), 2)).corrupted
-    for depth in (meters()[None], enlarged(meters(), 2), enlarged(meters(), 6).astype(np.float32)):
+    frame, path = read_image(picture)[None], tmp_path / "still.apng"
+    for depth in (meters()[None], tensor_of(meters())[0, 0].double().numpy(), tensor_of(meters(), factor=6)[0, 0]):
         np.save(tmp_path / "depth.npy", depth)
-        assert call("preview", "frame.png", *FOG, "depth=depth.npy").out == "preview.png: cape_town_fog on frame.png\n"
-        assert sheet_shows(tmp_path / "preview.png", expected)
-    assert not sheet_shows(tmp_path / "preview.png", row_of(cape_town_fog(), frame).corrupted)
+        outcome = call("preview", "frame.png", *FOG, *STILL, "depth=depth.npy")
+        assert outcome.out == "still.apng: cape_town_fog on frame.png, 1 frames\n"
+        assert still(path, cape_town_fog(), frame, depth=tensor_of(meters()))
+    assert not still(path, cape_town_fog(), frame)
 
 
 @pytest.mark.parametrize(("words", "scale"), [((), 1 / 256), (("depth_scale=0.1",), 0.1)])
 def test_a_depth_picture_counts_in_the_scale_and_its_largest_value_is_infinite(call, picture, tmp_path, words, scale):
     steps = np.where(np.isinf(meters()), 65535, meters() / scale).round().astype(np.uint16)
     Image.fromarray(steps).save(tmp_path / "depth.png")
-    outcome = call("preview", "frame.png", *FOG, "depth=depth.png", *words)
-    assert outcome.out == "preview.png: cape_town_fog on frame.png\n"
-    depth = enlarged(np.where(steps == 65535, np.inf, scale * steps), 2)
-    assert sheet_shows(
-        tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
-    )
+    outcome = call("preview", "frame.png", *FOG, *STILL, "depth=depth.png", *words)
+    assert outcome.out == "still.apng: cape_town_fog on frame.png, 1 frames\n"
+    depth = tensor_of(np.where(steps == 65535, np.inf, scale * steps))
+    assert still(tmp_path / "still.apng", cape_town_fog(), read_image(picture)[None], depth=depth)
 
 
 def test_depth_that_was_not_measured_counts_as_infinite_and_is_reported(call, picture, tmp_path):
@@ -313,16 +306,14 @@ def test_depth_that_was_not_measured_counts_as_infinite_and_is_reported(call, pi
     steps[:6] = 0
     Image.fromarray(steps).save(tmp_path / "depth.png")
     np.save(tmp_path / "depth.npy", steps / 256)
-    depth = np.where(steps == 0, np.inf, 40.0)
+    depth = tensor_of(np.where(steps == 0, np.inf, 40.0), factor=1)
     for name in ("depth.png", "depth.npy"):
-        outcome = call("preview", "frame.png", *FOG, f"depth={name}")
-        assert outcome.out == "preview.png: cape_town_fog on frame.png; 25.0% of its depth is 0, taken as infinite\n"
-        assert sheet_shows(
-            tmp_path / "preview.png", row_of(cape_town_fog(), read_image(picture)[None], depth=depth).corrupted
-        )
+        outcome = call("preview", "frame.png", *FOG, *STILL, f"depth={name}")
+        assert outcome.out.endswith(", 1 frames; 25.0% of its depth is 0, taken as infinite\n")
+        assert still(tmp_path / "still.apng", cape_town_fog(), read_image(picture)[None], depth=depth)
 
 
-def test_depth_is_cropped_with_its_picture(call, picture, tmp_path):
+def test_a_contact_sheet_crops_depth_with_its_picture(call, picture, tmp_path):
     np.save(tmp_path / "depth.npy", meters())
     assert call("preview", "frame.png", *FOG, "depth=depth.npy", "size=[12,8]").code == 0
     frame = read_image(picture)[None, :, ::2, 8:24:2].contiguous()
@@ -345,13 +336,20 @@ def test_depth_is_cropped_with_its_picture(call, picture, tmp_path):
         ("d.png", np.ones((12, 16, 3), np.uint8), "depth must be a gray PNG of 16 bits, or a .npy in m, got d.png"),
     ],
 )
-def test_a_wrong_or_truncated_depth_is_one_line_of_error(call, picture, tmp_path, name, depth, message):
+def test_a_wrong_depth_is_one_line_of_error(call, picture, tmp_path, name, depth, message):
     path = tmp_path / name
     np.save(path, depth, allow_pickle=True) if path.suffix == ".npy" else Image.fromarray(depth).save(path)
     assert re.search(message, text := call("preview", "frame.png", *FOG, f"depth={name}").message), text
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert re.search("damaged|truncated", call("preview", "frame.png", *FOG, f"depth={name}").message)
     assert not (tmp_path / "preview.png").exists()
+
+
+def test_a_truncated_depth_is_one_line_of_error(call, picture, tmp_path):
+    np.save(tmp_path / "d.npy", meters())
+    Image.fromarray(meters().clip(0, 200).astype(np.uint16)).save(tmp_path / "d.png")
+    for name in ("d.npy", "d.png"):
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
+        assert re.search("damaged|truncated", call("preview", "frame.png", *FOG, f"depth={name}").message)
 
 
 def test_depth_needs_a_picture_and_a_scale(call, picture):
@@ -379,9 +377,7 @@ def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
     assert call("preview", *FOG, "size=[24,32]", "seed=7", "out=fog.apng", "frames=2").code == 0
     frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)
     for t, shown in enumerate(pictures_of(tmp_path / "fog.apng")):
-        image = cape_town_fog().degrade(frame, seed=7, depth=depth, frame=t).image[0]
-        large = (255 * image).round().byte().repeat_interleave(10, 1).repeat_interleave(10, 2)
-        assert shows(shown, large.movedim(0, -1).numpy())
+        assert shows(shown, as_displayed(cape_town_fog().degrade(frame, seed=7, depth=depth, frame=t).image[0]))
 
 
 @pytest.mark.parametrize("source", ["drive", "drive.avi"])
@@ -411,16 +407,16 @@ def test_one_depth_map_for_all_frames_of_a_drive_is_said(call, frames, picture, 
     words = (*FOG, "depth=depth.npy", "frames=2")
     warning = "warning: depth.npy is one depth map for all 2 frames; depth= takes a folder with one for each"
     assert warning in call("preview", "drive", *words, "out=fog.gif").err
-    assert call("preview", "drive", *words, "out=fog.png").err == ""
+    assert call("preview", "drive", *words, "out=fog.png").err == ""  # shows the first frame alone
     assert call("preview", "frame.png", *words, "out=fog.gif").err == ""
 
 
-@pytest.mark.parametrize(("max_frames", "count"), [(3, 3), (100, 12)])
-def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path, max_frames, count):
-    outcome = call("preview", "drive", *FLARE, "out=flare.apng", f"frames={max_frames}")
-    assert outcome.out == f"flare.apng: limpopo_sun_glare on drive, {count} frames\n"
+def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path):
+    for max_frames, count in ((3, 3), (100, 12)):
+        outcome = call("preview", "drive", *FLARE, "out=flare.apng", f"frames={max_frames}")
+        assert outcome.out == f"flare.apng: limpopo_sun_glare on drive, {count} frames\n"
     pictures = pictures_of(tmp_path / "flare.apng")
-    assert len(pictures) == count
+    assert len(pictures) == 12
     assert all(shows(shown, flare_at(frames[t], t)) for t, shown in enumerate(pictures))
 
 
@@ -437,15 +433,15 @@ def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, 
 
 
 def test_an_animation_is_read_like_a_video(call, picture, tmp_path):
-    assert call("preview", "frame.png", *FLARE, "out=flare.gif", "frames=3").code == 0
+    pages = [Image.new("RGB", (32, 24), (80 * k, 0, 0)) for k in range(3)]
+    pages[0].save(tmp_path / "flare.gif", save_all=True, append_images=pages[1:])
     assert call("preview", "flare.gif", *FLARE, "out=again.gif").out.endswith("on flare.gif, 3 frames\n")
 
 
 def test_frames_are_cropped_and_reduced(call, frames, tmp_path):
     assert call("preview", "drive", *LENS, "size=[12,16]", "out=lens.apng", "frames=2").code == 0
     image = tr.LensDistortion().degrade(fit(frames[1][0], (12, 16)), seed=0).image
-    large = (255 * image).round().byte().repeat_interleave(20, 1).repeat_interleave(20, 2).movedim(0, -1).numpy()
-    assert shows(pictures_of(tmp_path / "lens.apng")[1], large)
+    assert shows(pictures_of(tmp_path / "lens.apng")[1], as_displayed(image, factor=20))
 
 
 def test_frames_that_cannot_be_played_are_one_line_of_error(call, frames, picture, tmp_path):

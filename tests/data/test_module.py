@@ -1,9 +1,4 @@
 import multiprocessing
-import os
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,9 +11,12 @@ from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
 from torchrefract.data.module import PairData, frames, make_pair, pairs, road_scenes
 from torchrefract.data.road_scenes import RoadScenes
 
-ROOT = Path(__file__).parents[2]
 SIZE = (12, 20)
 COUNT = 10
+QUIET: dict[str, Any] = {
+    **{"accelerator": "cpu", "logger": False, "enable_checkpointing": False},
+    **{"enable_progress_bar": False, "enable_model_summary": False},
+}
 
 
 def scenes(*, effect: LensDistortion | UniformFog | None = None, batch_size: int = 4, workers: int = 0, seed: int = 0):
@@ -214,33 +212,18 @@ def test_two_ranks_share_the_training_frames_and_validate_each_once(first_epoch,
         scenes(batch_size=1).check_ranks(6)
 
 
-def test_a_trainer_with_its_default_sampler_for_two_processes_validates_each_frame_once(tmp_path):
+@pytest.mark.filterwarnings("ignore:.*does not have many workers", "ignore:.*LeafSpec")  # of Lightning
+def test_a_trainer_with_its_default_sampler_for_two_processes_validates_each_frame_once(tmp_path, monkeypatch):
     """Lightning replaces a sampler of another type by one that takes a share of the share of a process."""
-    script = """
-        import sys
-        from pytorch_lightning import LightningModule, Trainer
-        from torchrefract import LensDistortion
-        from torchrefract.data.module import road_scenes
 
-        class Module(LightningModule):
-            def validation_step(self, batch, _):
-                with open(f"{self.global_rank}.txt", "a") as file:
-                    file.writelines(f"{key}\\n" for key in batch.key.tolist())
+    class Module(LightningModule):
+        def validation_step(self, batch: Pair, _: int) -> None:
+            with (tmp_path / f"{self.global_rank}.txt").open("a") as file:
+                file.writelines(f"{key}\n" for key in batch.key.tolist())
 
-        data = road_scenes(
-            effect=LensDistortion(), size=(8, 14), train_count=4, val_count=7, batch_size=2, workers=0
-        )
-        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-        trainer = Trainer(accelerator="cpu", devices=2, strategy="ddp", **quiet)
-        trainer.validate(Module(), datamodule=data, verbose=False)
-    """
-    path = tmp_path / "validate.py"
-    path.write_text(textwrap.dedent(script))
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}
-    run = subprocess.run(
-        [sys.executable, str(path)], cwd=tmp_path, env=environment, capture_output=True, timeout=200, check=False
-    )
-    assert run.returncode == 0, run.stderr.decode()
+    monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
+    data = road_scenes(effect=LensDistortion(), size=(8, 14), train_count=4, val_count=7, batch_size=2, workers=0)
+    Trainer(devices=2, strategy="ddp_fork", **QUIET).validate(Module(), datamodule=data, verbose=False)
     parts = [(tmp_path / f"{rank}.txt").read_text().split() for rank in range(2)]
     assert sorted(int(key) for part in parts for key in part) == list(range(4, 11))
 
@@ -259,10 +242,9 @@ def test_a_trainer_that_overfits_batches_gets_the_first_ones_in_each_epoch(tars)
 
         def configure_optimizers(self) -> None: ...
 
-    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "accelerator": "cpu"}
     from_tars = pairs(root=tars, batch_size=4, workers=0, buffer=5)
     for data, expected in ((scenes(), list(range(8))), (from_tars, None)):
-        module, trainer = Module(), Trainer(max_epochs=2, overfit_batches=2, enable_model_summary=False, **quiet)
+        module, trainer = Module(), Trainer(max_epochs=2, overfit_batches=2, **QUIET)
         trainer.fit(module, datamodule=data)
         assert len(module.keys) == 16
         assert module.keys[:8] == (expected or module.keys[8:])
@@ -293,13 +275,7 @@ def test_frames_of_a_folder_are_split_by_drive_and_have_no_depth(tmp_path, batch
 
 def test_lightning_gets_the_same_pairs(first_epoch):
     data = scenes()
-    data.trainer = trainer = Trainer(
-        logger=False,
-        accelerator="cpu",
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    data.trainer = trainer = Trainer(**QUIET)
     trainer.state.fn, trainer.training = "fit", True  # pyright: ignore[reportAttributeAccessIssue]  # a word for an enum
     frame = Frame(*next(iter(data.train_dataloader())))
     assert_same(by_key([data.on_after_batch_transfer(frame, 0)]), first_epoch)

@@ -44,7 +44,7 @@ def test_a_run_in_a_store_is_stopped_continued_scored_and_applied(call, small, s
     assert epochs == ["0", "1"]  # Google's storage cannot append to a file
     assert read_checkpoint(as_path(last), task="undistort")["global_step"] == 8
     outcome = call("eval", f"ckpt_path={store}/a/best.ckpt")
-    assert f"scoring {store}/a/best.ckpt on 8 validation frames of RoadScenes" in outcome.out
+    assert f"scoring {store}/a/best.ckpt on 4 validation frames of RoadScenes" in outcome.out
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "raw.png")
     assert call("restore", f"ckpt_path={store}/a/best.ckpt", "input=raw.png", "out=out").code == 0

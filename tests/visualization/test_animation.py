@@ -72,17 +72,17 @@ def cell(pictures: np.ndarray, animation: Animation, i: int, column: int) -> np.
 
 @pytest.mark.parametrize("suffix", LOSSES)
 def test_each_decoded_frame_is_that_of_its_time(tmp_path, frame, suffix):
-    animation = make_animation(EFFECTS, repeated(frame, 7), seed=3)
+    animation = make_animation(EFFECTS, repeated(frame, 5), seed=3)
     save_animation(animation, tmp_path / f"effects{suffix}", fps=12)
     pictures = decoded(tmp_path / f"effects{suffix}")
-    assert pictures.shape == (7, *animation.background.shape)
+    assert pictures.shape == (5, *animation.background.shape)
     for i, effect in enumerate(EFFECTS.values()):
-        expected = np.stack([displayed(effect.degrade(frame, seed=3, frame=t).image) for t in range(7)]).astype(int)
+        expected = np.stack([displayed(effect.degrade(frame, seed=3, frame=t).image) for t in range(5)]).astype(int)
         shown = cell(pictures, animation, i, 0)
         assert np.abs(shown - expected).mean() <= LOSSES[suffix]
         if effect is not FOG:
             differences = np.abs(shown[:, None] - expected).mean(axis=(2, 3, 4))
-            assert differences.argmin(axis=1).tolist() == list(range(7))
+            assert differences.argmin(axis=1).tolist() == list(range(5))
 
 
 @pytest.mark.parametrize("suffix", [".apng", ".gif"])
@@ -183,8 +183,9 @@ def test_an_animation_may_have_one_frame_and_a_suffix_in_capitals(tmp_path, fram
     assert np.abs(shown - displayed(FLARE.degrade(frame, seed=1).image)).mean() <= LOSSES[suffix]
 
 
-@pytest.mark.parametrize("size", [(24, 40), (281, 501), (90, 30), (12, 241), (1, 1)])
-@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize(
+    ("size", "count"), [((24, 40), 5), ((281, 501), 1), ((90, 30), 1), ((12, 241), 5), ((1, 1), 1), ((1, 1), 5)]
+)
 def test_a_background_has_even_sides_and_no_text_at_its_border_or_under_an_image(size, count):
     effects = dict(list(({"heterogeneous fog": tr.HeterogeneousFog()} | EFFECTS | {"lens": LENS}).items())[:count])
     animation = make_animation(effects, repeated(torch.rand(1, 3, *size), 2), seed=1)

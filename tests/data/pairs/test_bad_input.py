@@ -50,8 +50,6 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("tar=0", "tar must be at least 1, got 0"),
         ("workers=-1", "workers must be at least 0, got -1"),
         ("seed=3000000000", "seed must be below 2147483648, got 3000000000"),
-        ("val_share=1", "val_share must be between 0 and 1, got 1.0"),
-        ("drive_by=car", "drive_by must be one of auto, folder, prefix, got 'car'"),
         ("verify=7", "verify must be True or False, got 7"),
         ("scene.severity=9", "scene: severity must be one of 1, 2, 3, 4, 5, got 9"),
     ],
@@ -69,9 +67,9 @@ def test_a_license_and_a_scene_are_required(call, words):
 
 
 def test_a_folder_of_another_configuration_raises_with_the_differences(call, words, tmp_path, sums):
-    assert call("generate", *words("out", "count=12")).code == 0
+    assert call("generate", *words("out", "count=2")).code == 0
     before = sums(tmp_path / "out")
-    message = call("generate", *words("out", "count=12", "seed=5", "scene.severity=2")).message
+    message = call("generate", *words("out", "count=2", "seed=5", "scene.severity=2")).message
     assert "scene.severity is 3 there and 2 here, seed is 0 there and 5 here" in message
     assert sums(tmp_path / "out") == before
 
@@ -89,18 +87,20 @@ def test_an_output_folder_must_be_new_and_lie_outside_of_the_source(call, words,
         PairedFolder(tmp_path / "out")
 
 
-@pytest.mark.parametrize("change", [{"count": "x"}, {"settings": []}, {"settings": {}}])
-def test_a_configuration_of_other_types_is_one_line(call, words, tmp_path, change):
+def test_a_configuration_of_other_types_is_one_line(call, words, tmp_path):
     assert call("generate", *words("out", "count=2")).code == 0
     path = tmp_path / "out" / "config.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    assert call("merge", "out=out").message.startswith("out must be a folder of generate with a valid config.json, got")
-    assert call("generate", *words("out", "count=2")).message.startswith("out must be a folder ")
+    content = json.loads(path.read_text())
+    for change in ({"count": "x"}, {"settings": []}, {"settings": {}}):
+        path.write_text(json.dumps(content | change))
+        message = "out must be a folder of generate with a valid config.json, got"
+        assert call("merge", "out=out").message.startswith(message)
+        assert call("generate", *words("out", "count=2")).message.startswith("out must be a folder ")
 
 
 def test_a_relative_folder_with_a_colon_is_no_address(call, words, tmp_path):
-    assert call("generate", *words("cam:07-30", "count=2")).code == 0
-    assert len(PairedFolder(tmp_path / "cam:07-30")) == 2
+    assert call("generate", *words("cam:07-30", "count=1")).code == 0
+    assert len(PairedFolder(tmp_path / "cam:07-30")) == 1
 
 
 def test_changed_sources_that_are_listed_again_raise(call, words, frames, tmp_path):

@@ -33,8 +33,13 @@ def made(call, words, sets):
     return make
 
 
-@pytest.mark.parametrize("maps", ["png", "npz", "safetensors"])
-@pytest.mark.parametrize("scene", ["paper_refractive", "paper_weather"])
+@pytest.mark.parametrize(
+    ("scene", "maps"),
+    [
+        *(("paper_refractive", "png"), ("paper_refractive", "npz")),
+        *(("paper_weather", "png"), ("paper_weather", "safetensors")),
+    ],
+)
 def test_pairs_from_disk_equal_pairs_on_the_fly(made, frames, batches, scene, maps):
     has_light = scene == "paper_weather"
     options = {"batch_size": 4, "workers": 0, "transmission": has_light}

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -48,11 +49,11 @@ def copied(call, words, frames, tmp_path) -> Callable[..., Path]:
     (tmp_path / "frames" / "drive0" / "000.png").unlink()
 
     def make(option: str) -> Path:
-        others = {"scene": "cheap_dashcam"} if "scene=" in option else {}
-        others |= {"count": 18} if "count" in option else {}
+        others: dict[str, Any] = {"scene": "cheap_dashcam"} if "scene=" in option else {}
+        name = option.partition("=")[0]
+        others["count"] = {"count": 18, "source": 12}.get(name, 6)
         for shard in (0, 1):
             options = ["shards=2", f"shard={shard}", *([option] if shard else [])]
-            name = option.partition("=")[0]
             given = [word for word in words(f"out{shard}", **others) if not (shard and word.startswith(f"{name}="))]
             assert call("generate", *given, *options).code == 0
         shutil.copytree(tmp_path / "out1", tmp_path / "out0", dirs_exist_ok=True)
@@ -75,7 +76,7 @@ def test_shards_of_other_options_in_one_folder_are_an_error(call, words, copied,
     copied(option)
     start = f"out must hold shards of one configuration, got out0, where {different}"
     assert call("merge", "out=out0").message.startswith(start)
-    message = call("generate", *words("out0")).message  # must not continue one of them either
+    message = call("generate", *words("out0", "count=6")).message  # must not continue one of them either
     assert message.startswith("out must be a folder of the same configuration, got out0, where ")
 
 
@@ -91,12 +92,12 @@ def test_shards_of_another_seed_or_scene_without_their_options_are_an_error(call
     for path in copied(option).glob("config-*"):
         path.unlink()
     message = call("merge", "out=out0").message
-    assert message.startswith("out must hold pairs of one configuration, got 6 of another seed or scene: 0, 2, 4 ")
+    assert message.startswith("out must hold pairs of one configuration, got 3 of another seed or scene: 0, 2, 4")
 
 
 def test_the_table_of_pairs_has_a_row_for_each_pair_and_a_column_for_each_drawn_quantity(call, words, tmp_path, rows):
     out = tmp_path / "out"
-    options = words("out", "shards=2", scene="cheap_dashcam")
+    options = words("out", "shards=2", "count=6", scene="cheap_dashcam")
     for shard in (0, 1):
         assert call("generate", *options, f"shard={shard}").code == 0
     content = (out / "pairs.parquet").read_bytes()
@@ -117,7 +118,7 @@ def test_the_table_of_pairs_has_a_row_for_each_pair_and_a_column_for_each_drawn_
             for name, value in effect.items()
             if name != "effect"
         }
-    assert len({row["LensDistortion.coefficients"][0] for row in table}) == 12
+    assert len({row["LensDistortion.coefficients"][0] for row in table}) == 6
 
 
 def test_pairs_of_one_draw_are_an_error(call, words, tmp_path, rows):

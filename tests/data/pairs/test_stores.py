@@ -39,13 +39,12 @@ def sums_on_disk(sums: Callable[[Path], dict[str, str]], out: Path) -> dict[str,
 
 @pytest.mark.parametrize("tar", ["null", "5"])
 def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, sums, tmp_path, tar):
-    options = ("count=10", f"tar={tar}")
+    options = ("count=6", f"tar={tar}")
     assert call("generate", *words("memory://out", *options, source="memory://frames")).code == 0
     assert call("generate", *words("file://" + str(tmp_path / "out"), *options)).code == 0
     assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
     assert (
-        ": 0 pairs made, 10 in total"
-        in call("generate", *words("memory://out", *options, source="memory://frames")).out
+        ": 0 pairs made, 6 in total" in call("generate", *words("memory://out", *options, source="memory://frames")).out
     )
     pairs = PairedFolder("memory://out")
     assert (pairs[3].clean == PairedFolder(tmp_path / "out")[3].clean).all()
@@ -77,11 +76,11 @@ def test_shards_in_a_store_keep_the_rows_of_one_another(call, words, memory, mon
     monkeypatch.setattr("torchrefract.data.pairs.manifest._PART_SECONDS", -1.0)
     for shards in (2, 1):
         for shard in range(shards):
-            options = words("memory://out", f"shards={shards}", f"shard={shard}", source="memory://frames")
+            options = words("memory://out", "count=4", f"shards={shards}", f"shard={shard}", source="memory://frames")
             assert call("generate", *options).code == 0
         names = [path.rpartition("/")[2] for path in memory.glob("/out/manifest*")]
         assert len(names) == shards
-    assert len(PairedFolder("memory://out")) == 12
+    assert len(PairedFolder("memory://out")) == 4
 
 
 def test_a_store_that_denies_writing_is_one_line(call, words, memory, monkeypatch):
@@ -146,19 +145,20 @@ def test_an_invalid_address_raises(call, words, memory, option, message):
     assert call("generate", *options, option).message.startswith(message)
 
 
-@pytest.mark.parametrize("name", ["run [1]", "a?b", "*", "ü #1 = {x}"])
-def test_the_name_of_a_folder_in_a_store_is_no_pattern(call, words, memory, name):
+def test_the_name_of_a_folder_in_a_store_is_no_pattern(call, words, memory):
     """Other sets match such a pattern: their manifests must neither be read nor removed."""
-    assert call("generate", *words("memory://sets/1", "count=3", source="memory://frames")).code == 0
+    assert call("generate", *words("memory://sets/1", "count=1", source="memory://frames")).code == 0
     memory.copy("/sets/1", "/sets/a-b", recursive=True)
     memory.copy("/sets/1", "/sets/run 1", recursive=True)
-    before = sums_in(memory, "/sets")
-    options = words(f"memory://sets/{name}", "count=4", source="memory://frames")
-    assert ": 4 pairs made, 4 in total; see" in call("generate", *options).out
-    assert ": 0 pairs made, 4 in total; see" in call("generate", *options).out
-    assert ": 4 of 4 pairs" in call("merge", f"out=memory://sets/{name}").out
-    assert len(PairedFolder(f"memory://sets/{name}")) == 4
-    assert {path: value for path, value in sums_in(memory, "/sets").items() if f"/{name}/" not in path} == before
+    for name in ("run [1]", "a?b", "*", "ü #1 = {x}"):
+        before = sums_in(memory, "/sets")
+        options = words(f"memory://sets/{name}", "count=2", source="memory://frames")
+        assert ": 2 pairs made, 2 in total; see" in call("generate", *options).out
+        assert ": 0 pairs made, 2 in total; see" in call("generate", *options).out
+        assert ": 2 of 2 pairs" in call("merge", f"out=memory://sets/{name}").out
+        assert len(PairedFolder(f"memory://sets/{name}")) == 2
+        assert {path: value for path, value in sums_in(memory, "/sets").items() if f"/{name}/" not in path} == before
+        memory.rm(f"/sets/{name}", recursive=True)
 
 
 @pytest.mark.parametrize("times", [2, 100])
@@ -183,12 +183,12 @@ def test_a_listing_that_is_throttled_is_tried_again_and_loses_no_folder(call, wo
 
 
 def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
-    pages = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(6)]
+    pages = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(2)]
     for name in ("a.mp4", "b.mp4"):
         write_video(pages, tmp_path / name, fps=10, size=(48, 32))
         memory.put_file(str(tmp_path / name), f"/videos/{name}")
     assert call("generate", *words("memory://out", source="memory://videos")).code == 0
-    assert len(PairedFolder("memory://out")) == 12
+    assert len(PairedFolder("memory://out")) == 4
 
 
 @pytest.mark.parametrize(("protocol", "stop"), [("s3", signal.SIGKILL), ("gs", signal.SIGTERM)])

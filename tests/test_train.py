@@ -104,9 +104,9 @@ def test_a_network_of_lenses_says_so_for_other_warps(call):
 
 def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call):
     data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
-    dust = call("train", "+task=deweather", "scene=unpaved_road", *data, "trainer.max_epochs=1").out
+    dust = call("train", "+task=deweather", "scene=unpaved_road", *data, "trainer.max_epochs=1", "run_dir=dust").out
     assert "severity 3; it moves pixels too, which deweather does not undo: that takes +task=undistort" in dust
-    fog = call("train", "+task=deweather", "scene=cape_town_fog", *data, "trainer.max_epochs=1").out
+    fog = call("train", "+task=deweather", "scene=cape_town_fog", *data, "trainer.max_epochs=1", "run_dir=fog").out
     assert "severity 3\n" in fog
 
 
@@ -224,17 +224,20 @@ def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(s
     assert read_checkpoint(path, task="undistort")["global_step"] >= 2
 
 
-def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(fork, small, tmp_path, capfd):
+def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):
+    # Not forked from the tests: a forked process could wait forever for threads of its parent.
     words = ("+task=undistort", *small, "run_dir=run", "trainer.max_epochs=1000", "data.workers=1")
-    process = fork("train", *words, cwd=tmp_path)
-    try:
-        wait_for_checkpoint(tmp_path / "run" / "last.ckpt", process.is_alive)
-        os.killpg(process.pid, signal.SIGTERM)  # as SLURM and systemd send it
-        process.join(timeout=60)
-    finally:
-        process.kill()
-    message = capfd.readouterr().err
-    assert process.exitcode == 143, message
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    options = {"cwd": tmp_path, "env": environment, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-m", "torchrefract.train", *words]
+    with subprocess.Popen(command, start_new_session=True, **options) as process:
+        try:
+            wait_for_checkpoint(tmp_path / "run" / "last.ckpt", lambda: process.poll() is None)
+            os.killpg(process.pid, signal.SIGTERM)  # as SLURM and systemd send it
+            _, message = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 143, message
     (line,) = (line for line in message.splitlines() if "stopped" in line or "Error" in line)
     assert re.fullmatch(r"stopped by SIGTERM in step \d+; ckpt_path=run/last.ckpt continues", line)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import expand_batch
+from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import check_number, check_range, check_within, eager_bool, finite_or, requires_grad
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to, per_sample
@@ -18,7 +18,14 @@ from torchrefract.fields.depth import DepthSource, check_depth_provider, frame_d
 from torchrefract.fields.exposure import finite_image
 from torchrefract.fields.physical_turbulence import GREEN, fried_parameter, height_gain, height_gains
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
-from torchrefract.fields.turbulence_blur import View, blur_by_distance, distances_for, halo_px, largest_change
+from torchrefract.fields.turbulence_blur import (
+    Distances,
+    View,
+    blur_by_distance,
+    distances_for,
+    halo_px,
+    largest_change,
+)
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_turbulence_blur
 from torchrefract.types import Range
 
@@ -177,7 +184,7 @@ class TurbulenceBlur(PhotometricEffect):
             light,
             expand_batch(strength, len(image)),
             view,
-            distances=distances_for(largest, view),
+            distances=self._constant_distances(id(self), height, width),
             halo=halo_px(largest, view),
         )
         return Rendered(linear_to_srgb(blurred.clamp(0, 1)), is_valid)
@@ -186,6 +193,11 @@ class TurbulenceBlur(PhotometricEffect):
     def _largest_strength(self) -> float:
         gain = 1.0 if self.height is None else max(self._gains)
         return self._highest_ratio ** (5 / 3) * gain**2
+
+    # torch.compile takes the distances as a constant; see `WarpEffect`.
+    @assume_constant_result
+    def _constant_distances(self, _: int, height: int, width: int) -> Distances:
+        return distances_for(self._largest_strength, self._view(height, width))
 
     def _view(self, height: int, width: int) -> View:
         focal, _ = pinhole_of(self.camera, height=height, width=width, focal=self.focal)

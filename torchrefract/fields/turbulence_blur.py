@@ -81,7 +81,7 @@ def distances_for(strength: float, view: View) -> Distances:
     shares = torch.linspace(0, 1, _GRID, dtype=torch.float64, device="cpu").square()
     error = torch.exp(-largest * shares[:, None] * shares)
     chosen: list[tuple[int, int]] = []
-    while len(chosen) < 2 or error.abs().amax() > _ERROR:
+    while error.abs().amax() > _ERROR:
         place, exponent = divmod(int(error.abs().argmax()), _GRID)
         chosen.append((place, exponent))
         error = error - error[:, exponent, None] * error[place] / error[place, exponent]

@@ -2,7 +2,6 @@ import gc
 import importlib
 import logging
 import math
-import multiprocessing
 import os
 import socket
 import subprocess
@@ -11,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -316,32 +314,6 @@ def spawn() -> Callable[..., Outcome]:
         return Outcome(done.returncode, done.stdout, done.stderr)
 
     return run
-
-
-@pytest.fixture(scope="session")
-def fork() -> Callable[..., Any]:
-    """Return a function that starts a command in a process forked from this one, which has imported everything.
-
-    The process leads a group of its own, and uses one thread.
-    """
-
-    def start(name: str, *words: str, cwd: Path) -> Any:
-        def run() -> None:
-            server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]  # not in stubs
-            server._forkserver_pid = server._forkserver_alive_fd = (
-                None  # that of this process is no child of the new one
-            )
-            os.setsid()
-            os.chdir(cwd)
-            torch.set_num_threads(1)
-            sys.argv = [f"torchrefract.{name}", *words]
-            importlib.import_module(f"torchrefract.{name}").main()
-
-        process = multiprocessing.get_context("fork").Process(target=run)
-        process.start()
-        return process
-
-    return start
 
 
 @pytest.fixture(scope="session")

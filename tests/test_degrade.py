@@ -3,8 +3,11 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,21 +90,25 @@ def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder)
     assert message.startswith("out must be a folder of the same configuration, got out, where scene.severity is 4")
 
 
-def test_ctrl_c_while_the_processes_start_is_one_line(fork, folder, capfd):
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets background programs ignore it
-    process = fork("degrade", *WORDS, "out=later", "workers=1", cwd=folder)
-    signal.signal(signal.SIGINT, handler)
-    try:
-        end = time.monotonic() + 120
-        while not (folder / "later").exists() and process.is_alive() and time.monotonic() < end:
-            time.sleep(0.02)
-        time.sleep(1)  # the server of the processes imports the package, which takes seconds
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
-        process.join(timeout=60)
-    finally:
-        process.kill()
-    lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("warning: ")]
-    assert (process.exitcode, lines) == (130, ["stopped; the same command continues"])
+def test_ctrl_c_while_the_processes_start_is_one_line(folder):
+    command = [sys.executable, "-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    # A shell lets programs in the background ignore it.
+    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, **options) as process:
+        try:
+            end = time.monotonic() + 120
+            while not (folder / "later").exists() and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.02)
+            time.sleep(1)  # the server of the processes imports the package, which takes seconds
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
+            _, message = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    lines = [line for line in message.splitlines() if not line.startswith(("warning: ", "torchrefract: loading"))]
+    assert lines == ["stopped; the same command continues"]
 
 
 def test_displacements_scale_with_the_width_of_each_picture_unless_a_width_is_given(call, folder):

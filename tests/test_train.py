@@ -1,4 +1,6 @@
 import csv
+import importlib
+import multiprocessing
 import os
 import re
 import shutil
@@ -150,15 +152,24 @@ def send_in_second_epoch(number: int) -> Callable[..., Tensor]:
     return training_step
 
 
-def test_a_killed_run_resumes_at_its_epoch_and_ends_like_an_uninterrupted_one(
-    call, fork, trained, tmp_path, monkeypatch
-):
-    killed = tmp_path / "killed"
-    with monkeypatch.context() as patch:
-        patch.setattr(Restoration, "training_step", send_in_second_epoch(signal.SIGKILL))
-        process = fork("train", *trained.words, f"hydra.run.dir={killed}", cwd=tmp_path)
+@pytest.fixture
+def killed(monkeypatch, tmp_path, small) -> Path:
+    """Return the folder of a run that received SIGKILL in its second epoch."""
+
+    def run() -> None:
+        sys.argv = ["torchrefract.train", "+task=undistort", *small, "hydra.run.dir=killed"]
+        monkeypatch.setattr(Restoration, "training_step", send_in_second_epoch(signal.SIGKILL))
+        importlib.import_module("torchrefract.train").main()
+
+    # A process that is forked from this one has imported everything.
+    process = multiprocessing.get_context("fork").Process(target=run)
+    process.start()
     process.join(timeout=300)
     assert process.exitcode == -signal.SIGKILL
+    return tmp_path / "killed"
+
+
+def test_a_killed_run_resumes_at_its_epoch_and_ends_like_an_uninterrupted_one(call, trained, killed):
     for name in ("last.ckpt", "best.ckpt"):
         assert read_checkpoint(killed / name, task="undistort")["epoch"] == 0
     outcome = call("train", *trained.words, f"ckpt_path={killed / 'last.ckpt'}", "hydra.run.dir=run")

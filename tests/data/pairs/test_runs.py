@@ -2,23 +2,33 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[3]
 COUNT = 16
 
 
+def start(*words: str) -> subprocess.Popen[str]:
+    """Start the command in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "torchrefract.generate", *words]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
 @pytest.fixture(scope="module")
-def complete(tmp_path_factory, fork, words) -> Path:
+def complete(tmp_path_factory, words) -> Path:
     """A set made by one uninterrupted run."""
-    folder = tmp_path_factory.mktemp("complete")
-    run = fork("generate", *words("out", f"count={COUNT}"), cwd=folder)
-    run.join(timeout=300)
-    assert run.exitcode == 0
-    return folder / "out"
+    out = tmp_path_factory.mktemp("complete") / "out"
+    run = start(*words(out, f"count={COUNT}"))
+    _, err = run.communicate(timeout=300)
+    assert run.returncode == 0, err
+    return out
 
 
 def is_running(process: str) -> bool:
@@ -56,26 +66,23 @@ def without_manifests(files: dict[str, str]) -> dict[str, str]:
     return {name: value for name, value in files.items() if not name.startswith(("manifest", "config-"))}
 
 
-def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(
-    call, fork, tmp_path, words, sums, complete
-):
+def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, sums, complete):
     out, arguments = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
-    run = fork("generate", *arguments, "workers=2", cwd=tmp_path)
+    run = start(*arguments, "workers=2")
     # Kill it after two pairs, somewhere in a later one.
-    wait_for(lambda: not run.is_alive() or len(list(out.rglob("*.png"))) > 8)
+    wait_for(lambda: run.poll() is not None or len(list(out.rglob("*.png"))) > 8)
     processes = descendants(run.pid)
-    run.kill()
-    run.join()
-    assert run.exitcode == -signal.SIGKILL
+    run.send_signal(signal.SIGKILL)
+    run.communicate()
     # A worker that outlived the run could write at the same time as the next run.
     wait_for(lambda: not any(is_running(process) for process in processes))
     assert "exist already" in call("generate", *arguments).out
     assert sums(out) == sums(complete)
 
 
-def test_a_killed_worker_stops_the_run_with_a_message(fork, tmp_path, words, capfd):
+def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
     out = tmp_path / "out"
-    run = fork("generate", *words(out, "count=4000", "workers=1"), cwd=tmp_path)
+    run = start(*words(out, "count=4000", "workers=1"))
     seen = dict[str, int]()
 
     def at_work() -> list[str]:
@@ -83,12 +90,11 @@ def test_a_killed_worker_stops_the_run_with_a_message(fork, tmp_path, words, cap
         files, workers = len(list(out.rglob("*.png"))), workers_of(run.pid)
         return [worker for worker in workers if files > seen.setdefault(worker, files) + 8]
 
-    wait_for(lambda: not run.is_alive() or bool(at_work()))
+    wait_for(lambda: run.poll() is not None or bool(at_work()))
     for worker in at_work():
         os.kill(int(worker), signal.SIGKILL)
-    run.join(timeout=100)
-    err = capfd.readouterr().err
-    assert run.exitcode == 1, err
+    _, err = run.communicate(timeout=100)
+    assert run.returncode == 1, err
     assert "\nerror: workers must fit the memory, got 1 of which one was killed" in "\n" + err
 
 

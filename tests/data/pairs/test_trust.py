@@ -75,7 +75,7 @@ def test_two_runs_into_one_folder_raise(call, words, tmp_path):
 
 
 def test_an_address_as_output_raises(call, tmp_path):
-    for out in ("s3://bucket/pairs", "gs://a", "file:///tmp/a", "'hf://datasets/a'"):
+    for out in ("s3://bucket/pairs", "gs://a", "file:///sets/a", "'hf://datasets/a'"):
         message = call("restore", f"out={out}").message
         assert message.startswith(f"out must be a path on this machine, got {out.strip(chr(39))}")
     assert not list(tmp_path.iterdir())

@@ -1,11 +1,10 @@
 """Small operations on tensors that several packages share."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import lru_cache, wraps
-from itertools import chain
 from typing import Any, TypeVar, cast
 
 import torch
@@ -127,23 +126,24 @@ def expand_batch(value: Tensor, batch: int) -> Tensor:
     return value.repeat_interleave(batch // value.shape[0], dim=0)
 
 
-def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
-    """Concatenate bands along a dimension of the given total length.
+def in_bands(compute: Callable[[int, int], Tensor], *, length: int, band: int, dim: int) -> Tensor:
+    """Compute a tensor of a length along a dimension in bands, each from one index to another.
 
     Without gradients each band is copied before the next one is made, so that all bands use the same memory.
     """
-    iterator = iter(bands)
-    first = next(iterator)
-    if first.shape[dim] == length:
+    first = compute(0, min(band, length))
+    if band >= length:
         return first
+    starts = range(band, length, band)
     if torch._C._are_functorch_transforms_active() or (first.requires_grad and torch.is_grad_enabled()):
-        return torch.cat([first, *iterator], dim=dim)
+        return torch.cat([first, *(compute(start, min(start + band, length)) for start in starts)], dim=dim)
     shape = list(first.shape)
     shape[dim] = length
-    result, start = first.new_empty(shape), 0
-    for band in chain([first], iterator):
-        result.narrow(dim, start, band.shape[dim]).copy_(band)
-        start += band.shape[dim]
+    result = first.new_empty(shape)
+    result.narrow(dim, 0, band).copy_(first)
+    for start in starts:
+        size = min(band, length - start)
+        result.narrow(dim, start, size).copy_(compute(start, start + size))
     return result
 
 

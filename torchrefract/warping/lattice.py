@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import cat_bands, rows_at_once
+from torchrefract._tensor import in_bands, rows_at_once
 from torchrefract._validation import eager_values
 from torchrefract.ops.sampling import interpolate_nodes, lagrange_basis
 from torchrefract.warping.grid import Points
@@ -106,9 +106,12 @@ class LatticeFlow:
         rows, columns = self.nodes.shape[2:]
         x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
         count, each = torch.broadcast_shapes(x.shape, y.shape)[2:]
+
+        def at_rows(start: int, stop: int) -> Tensor:
+            return _cubic(self.nodes, x if x.shape[2] == 1 else x[:, :, start:stop], y[:, :, start:stop])
+
         band = rows_at_once(x.device, count, each=each, cached=_CACHED_POINTS)
-        bands = ([at if at.shape[2] == 1 else at[:, :, i : i + band] for at in (x, y)] for i in range(0, count, band))
-        return cat_bands((_cubic(self.nodes, x, y) for x, y in bands), dim=2, length=count)
+        return in_bands(at_rows, length=count, band=band, dim=2)
 
 
 def within_reach(points: Points) -> Points:

@@ -16,7 +16,7 @@ from torchrefract._validation import (
     check_number,
     check_values,
     check_whole,
-    eager_bool,
+    eager_values,
     is_whole,
     requires_grad,
 )
@@ -282,7 +282,7 @@ class Effect(nn.Module, ABC):
     def may_change(self, params: Any) -> bool:
         """Return False if no sample changes; True if one does, if that cannot be read, or if gradients are needed."""
         active = params.applied & ~params.is_identity
-        return eager_bool(active.any, of=active) is not False or requires_grad(params)
+        return eager_values(active.any, of=active) is not False or requires_grad(params)
 
     def check_params(self, params: Any, image: Tensor) -> None:
         """Raise unless these are valid parameters of this effect for images (B, C, H, W).

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
-from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad, warn, why_not_eager
+from torchrefract._validation import check_tensor, check_within, eager_values, requires_grad, warn, why_not_eager
 from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.warping.grid import field_dtype
 
@@ -346,7 +346,7 @@ def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, par
         active: (N,) or (B,), bool.
         params: with B or N rows; needs `applied` and, for gradients, its tensors.
     """
-    if eager_bool(active.all, of=active):
+    if eager_values(active.all, of=active):
         return changed
     rows = changed.shape[0]
     shape = (-1, *[1] * (changed.ndim - 1))

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
@@ -263,7 +263,7 @@ def zero_flow(params: Any, plan: WarpPlan) -> FlowPart:
 
 def can_read(params: Any) -> bool:
     """Return True if the values of parameters can be read without waiting for a device."""
-    return eager_bool(params.applied.any, of=params.applied) is not None
+    return eager_values(params.applied.any, of=params.applied) is not None
 
 
 class BatchFlow:
@@ -317,7 +317,7 @@ class BatchFlow:
         if requires_grad(part.flow.nodes for part in self.parts):
             # Samples that do not move need the gradient of their parameters.
             return where_active(self._sample(image, None, chosen), image, active, params)
-        return self._sample(image, None if eager_bool(active.all, of=active) else active, chosen)
+        return self._sample(image, None if eager_values(active.all, of=active) else active, chosen)
 
     def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
         if len(self.parts) == 1:

@@ -15,7 +15,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
     eager_values,
     requires_grad,
     warn,
@@ -256,7 +255,7 @@ class LensDistortion(WarpEffect):
         lens = lens_in_px(params, height, width)
         if plan.details is None:
             flow, exists = lens_flow(*lens, points)
-            if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
+            if points.lattice.stride == 1 and eager_values(exists.all, of=exists) is False:
                 self._report_fold(params, exists, points)
         else:
             steps = plan.details.steps_for(points.lattice.stride)
@@ -289,7 +288,7 @@ class LensDistortion(WarpEffect):
             return effect
         fits = self._view(params, height, width)
         difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
-        return effect.exact() if eager_bool((difference <= _SAME_VIEW).all, of=difference) is False else effect
+        return effect.exact() if eager_values((difference <= _SAME_VIEW).all, of=difference) is False else effect
 
     def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
         """Return the camera of each degraded frame; see `clean_cameras` for that of its clean frame.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import assume_constant_result, expand_batch
-from torchrefract._validation import eager_bool, eager_values, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
@@ -86,7 +86,7 @@ class PhotometricEffect(Effect):
 
     def for_params(self, params: Any, height: int, width: int) -> "PhotometricEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
-        if self.tolerance is None or eager_bool(lambda: self.params_in_range(params), of=params.applied) is not False:
+        if self.tolerance is None or eager_values(lambda: self.params_in_range(params), of=params.applied) is not False:
             return self
         return self.exact()
 
@@ -104,13 +104,13 @@ class PhotometricEffect(Effect):
         index = _active_samples(active, params)
         if index is not None:
             return self._degrade_samples(image, params, depth, index)
-        if eager_bool(active.any, of=active) is False:
+        if eager_values(active.any, of=active) is False:
             depth = None  # its values do not matter, so they are not checked either
         rendered = self.render(image, params, depth)
 
         def masked_map(value: Map, unchanged: float | bool) -> Tensor:
             value = value() if callable(value) else value
-            if eager_bool(active.all, of=active) is not True:
+            if eager_values(active.all, of=active) is not True:
                 rows = max(value.shape[0], len(active))
                 value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
             return value.expand(-1, 1, *image.shape[2:])

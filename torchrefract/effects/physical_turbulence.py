@@ -16,7 +16,7 @@ from torchrefract._validation import (
     check_positive,
     check_range,
     check_within,
-    eager_bool,
+    eager_values,
     finite_or,
     requires_grad,
 )
@@ -237,7 +237,7 @@ class PhysicalTurbulence(WarpEffect):
     def _shift(self, params: PhysicalTurbulenceParams) -> Tensor | None:
         """Return (N, 2), m: how far the wind has moved the air, or None if it has not."""
         may_move = params.frame.shape[1] > 1 or requires_grad((params.frame, params.wind))
-        if not may_move and eager_bool((params.frame == 0).all, of=params.frame):
+        if not may_move and eager_values((params.frame == 0).all, of=params.frame):
             return None
         frame = finite_or(params.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME).double().reshape(-1, 1)
         wind = expand_batch(finite_or(params.wind, 0.0).clamp(-_FASTEST, _FASTEST), len(frame))

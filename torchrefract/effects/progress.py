@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool
+from torchrefract._validation import eager_values
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample
 from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
@@ -216,7 +216,7 @@ class Progress:
                 total, valid, moved = inverse, exists, moves
                 continue
             both, alone = per_sample(moved & moves), per_sample(moves)
-            if eager_bool(both.any, of=both) is not False:
+            if eager_values(both.any, of=both) is not False:
                 exists = torch.where(both, valid & sees_only_valid(exists, total), exists)
                 inverse = torch.where(both, compose_flows(inverse, total), inverse)
             total, valid = torch.where(alone, inverse, total), torch.where(alone, exists, valid)
@@ -268,7 +268,7 @@ def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], ac
     decided = active[-1]
     for leaf, moves in zip(reversed(leaves[:-1]), reversed(active[:-1]), strict=True):
         chosen = moves & ~decided
-        if leaf.options != leaves[-1].options and eager_bool(chosen.any, of=chosen) is not False:
+        if leaf.options != leaves[-1].options and eager_values(chosen.any, of=chosen) is not False:
             result = torch.where(per_sample(chosen), segment.sample(image, leaf.options), result)
         decided = decided | moves
     return result

@@ -10,7 +10,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
     eager_values,
     finite_or,
     requires_grad,
@@ -104,7 +103,7 @@ def _is_still(params: Any) -> bool:
     moving = (params.frame, params.wind, params.decorrelation)
     if params.frame.shape[1] > 1 or requires_grad(moving):
         return False
-    return eager_bool((params.frame == 0).all, of=params.frame) is True
+    return eager_values((params.frame == 0).all, of=params.frame) is True
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

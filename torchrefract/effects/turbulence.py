@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_choice, check_positive, eager_bool, warn
+from torchrefract._validation import check_choice, check_positive, eager_values, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import ParamsAtDepth, params_to
 from torchrefract.effects.batch_flow import everywhere
@@ -273,7 +273,7 @@ class Turbulence(WarpEffect):
             gradient = gradient_rms(params.length, kind=self.covariance, aperture=params.aperture)
             return (params.applied & (params.amplitude * gradient > _FOLDING_GRADIENT)).any()
 
-        if eager_bool(folds, of=params.applied):
+        if eager_values(folds, of=params.applied):
             warn(
                 "Turbulence this strong folds the image; folded pixels are excluded from restore_valid. Lower "
                 "amplitude_range, or raise length_range or aperture_range."

@@ -21,7 +21,7 @@ from torchrefract._tensor import (
     round_to_dtype,
     without_autocast,
 )
-from torchrefract._validation import eager_bool, requires_grad, why_not_eager
+from torchrefract._validation import eager_values, requires_grad, why_not_eager
 
 PADDINGS = ("zeros", "border", "reflection")
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
@@ -251,7 +251,7 @@ def _finite(values: Tensor, limit: float) -> Tensor:
     """Clamp values to [-limit, limit], and replace NaN by `limit`."""
     # With border padding, one NaN in a grid ends the process in the backward pass of F.grid_sample.
     is_bounded = lambda: torch.stack(values.aminmax()).abs().amax() <= limit  # noqa: E731 - used once
-    if values.numel() == 0 or eager_bool(is_bounded, of=values):
+    if values.numel() == 0 or eager_values(is_bounded, of=values):
         return values
     return values.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)
 

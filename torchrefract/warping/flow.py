@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, exact_matmul
-from torchrefract._validation import check_count, check_flow, check_tensor, eager_bool
+from torchrefract._validation import check_count, check_flow, check_tensor, eager_values
 from torchrefract.types import Folding
 from torchrefract.warping.grid import field_dtype, length, pixel_axes
 from torchrefract.warping.warp import sample_image
@@ -183,7 +183,7 @@ def is_shown_once(flow: Tensor, inverse: Tensor, exists: Tensor, valid: Tensor |
             is_excluded = is_excluded | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
         if valid is not None:
             is_excluded = is_excluded & ~_near_invalid(valid)
-        if eager_bool(is_excluded.any, of=flow) is False:
+        if eager_values(is_excluded.any, of=flow) is False:
             return ~is_excluded
         return ~_cover(flow, is_excluded)
 

@@ -41,8 +41,8 @@ class SamplingOptions(NamedTuple):
     interpolation: str | None = None
     backend: str | None = None
 
-    def or_else(self, other: "SamplingOptions") -> "SamplingOptions":
-        """Take the options of another where these are undecided."""
+    def or_else(self, other: Any) -> "SamplingOptions":
+        """Take the options of a warp, of a composition or of other options where these are undecided."""
         return SamplingOptions(
             self.padding or other.padding, self.interpolation or other.interpolation, self.backend or other.backend
         )
@@ -239,9 +239,9 @@ def _largest_stretch(start: Points, end: Points) -> Tensor:
     """Return (N,), the largest ratio of the distances of neighboring points after and before a map."""
     ratios = []
     for dim in (2, 3):
-        before, after = (
+        before, after = [
             torch.hypot(points.x.detach().diff(dim=dim), points.y.detach().diff(dim=dim)) for points in (start, end)
-        )
+        ]
         ratios.append((after / before.clamp(min=1e-6)).flatten(1).amax(dim=1))
     return torch.maximum(*ratios)
 
@@ -281,7 +281,7 @@ class BatchFlow:
     @property
     def is_zero(self) -> bool:
         """Return True if no flow was computed, because none exceeds the tolerance."""
-        return all(part.is_zero for part in self.parts)
+        return all([part.is_zero for part in self.parts])
 
     @property
     def dense(self) -> Tensor:
@@ -314,7 +314,7 @@ class BatchFlow:
             options: all decided.
         """
         chosen = options._asdict()
-        if requires_grad(part.flow.nodes for part in self.parts):
+        if requires_grad([part.flow.nodes for part in self.parts]):
             # Samples that do not move need the gradient of their parameters.
             return where_active(self._sample(image, None, chosen), image, active, params)
         return self._sample(image, None if eager_values(active.all, of=active) else active, chosen)

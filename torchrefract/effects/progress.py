@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -31,11 +31,11 @@ _COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 class Leaf(NamedTuple):
-    """An effect that is not a composition, with the sampling options of the compositions around it."""
+    """An effect of a composition, with what it needs."""
 
-    effect: Effect
-    options: SamplingOptions
-    params: Any = None
+    effect: Any  # a `WarpEffect` or a `PhotometricEffect`
+    params: Any
+    options: SamplingOptions  # first those of the compositions around it
 
 
 class _Segment(NamedTuple):
@@ -116,9 +116,8 @@ class Progress:
         self._frame = self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
-            warp = cast(WarpEffect, leaf.effect)
-            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, share_px))
-            self.warps.append((warp, leaf.params, flow, moves))
+            flow = _remember(partial(leaf.effect.planned_flow, leaf.params, height, width, share_px))
+            self.warps.append((leaf.effect, leaf.params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
 
@@ -145,27 +144,17 @@ class Progress:
         """Apply a photometric effect."""
         depth = self.depth_for(effect) if effect.may_change(params) else self.depth
         shaded = effect.degrade_batch(self.image, params, depth)
-        rows, before, valid = self.image.shape[0], dict(self.light), self.valid
+        rows, light = self.image.shape[0], dict(self.light)
         self.image = shaded.image
-        self.valid = (
-            (lambda: expand_batch(shaded.valid, rows))
-            if valid is None
-            else (lambda: valid() & expand_batch(shaded.valid, rows))
-        )
 
-        def own_map(name: str) -> Callable[[], Tensor] | None:
-            return (lambda: expand_batch(getattr(shaded, name), rows)) if shaded.has(name) else None
+        def each_frame(name: str) -> Callable[[], Tensor]:
+            return lambda: expand_batch(getattr(shaded, name), rows)
 
-        transmission = own_map("transmission")
-        if "intensity" in before and transmission is not None:  # light that was added before is attenuated
-            added = before["intensity"]
-            before["intensity"] = lambda: added() * transmission()
-        self.light = before
-        for name, combine in _COMBINE.items():
-            value = own_map(name)
-            if value is not None:
-                earlier = self.light.get(name)
-                self.light[name] = value if earlier is None else _combined(combine, earlier, value)
+        self.valid = _combined(torch.logical_and, self.valid, each_frame("valid"))
+        maps = {name: each_frame(name) for name in _COMBINE if shaded.has(name)}
+        if "intensity" in light and "transmission" in maps:  # light that was added before is attenuated
+            light["intensity"] = _combined(torch.mul, light["intensity"], maps["transmission"])
+        self.light = light | {name: _combined(_COMBINE[name], light.get(name), value) for name, value in maps.items()}
 
     def result(self, params: Any) -> Degraded:
         """Return the images with all maps."""
@@ -194,11 +183,7 @@ class Progress:
             return torch.zeros(rows, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
         flow = self.segments[-1].flow.dense
         for segment in reversed(self.segments[:-1]):
-            flow = torch.where(
-                per_sample(segment.active),
-                compose_flows(segment.flow.dense, flow),
-                flow,
-            )
+            flow = torch.where(per_sample(segment.active), compose_flows(segment.flow.dense, flow), flow)
         return flow
 
     def _is_composed(self) -> Tensor:
@@ -257,9 +242,10 @@ def _moved(value: Callable[[], Tensor], segment: _Segment) -> Callable[[], Tenso
 
 
 def _combined(
-    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor], second: Callable[[], Tensor]
+    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor] | None, second: Callable[[], Tensor]
 ) -> Callable[[], Tensor]:
-    return lambda: combine(first(), second())
+    """Return a map that combines two; the second one if there is no first."""
+    return second if first is None else lambda: combine(first(), second())
 
 
 def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], active: Sequence[Tensor]) -> Tensor:

@@ -1,6 +1,6 @@
 """Small operations on tensors that several packages share."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract._validation import requires_grad
+from torchrefract.types import Range
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
@@ -112,6 +113,13 @@ def _is_equal(value: Any, other: Any) -> bool:
     if isinstance(value, Tensor) and isinstance(other, Tensor):
         return value.dtype == other.dtype and value.device == other.device and torch.equal(value, other)
     return type(value) is type(other) and value == other
+
+
+def in_ranges(values: Tensor, ranges: Sequence[Range]) -> Tensor:
+    """Return (), bool: all values (B, n) lie in the n ranges, up to rounding."""
+    low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
+    margin = 1e-5 * torch.maximum(low.abs(), high.abs())
+    return ((values >= low - margin) & (values <= high + margin)).all()
 
 
 def expand_batch(value: Tensor, batch: int) -> Tensor:

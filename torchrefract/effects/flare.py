@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, assume_constant_result, expand_batch
+from torchrefract._tensor import as_device_tensor, assume_constant_result, expand_batch, in_ranges
 from torchrefract._validation import (
     check_choice,
     check_color,
@@ -24,7 +24,7 @@ from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
 from torchrefract.fields.srgb import color_per_channel
-from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_flare
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, plan_flare
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 

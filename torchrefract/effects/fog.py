@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, cached_constant, expand_batch
+from torchrefract._tensor import as_device_tensor, cached_constant, expand_batch, in_ranges
 from torchrefract._validation import (
     check_color,
     check_flag,
@@ -46,7 +46,6 @@ from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
     PhotometricRequest,
-    in_ranges,
     plan_uniform_fog,
 )
 from torchrefract.types import Range

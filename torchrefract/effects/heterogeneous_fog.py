@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._tensor import as_device_tensor, expand_batch, in_ranges
 from torchrefract._validation import (
     check_choice,
     check_number,
@@ -43,7 +43,6 @@ from torchrefract.labels.vehicles import check_vehicle_labels
 from torchrefract.planning.photometric import (
     PhotometricPlan,
     PhotometricRequest,
-    in_ranges,
     plan_image_fog,
     plan_uniform_fog,
     plan_volumetric_fog,

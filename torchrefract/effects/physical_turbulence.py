@@ -4,12 +4,11 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import expand_batch
+from torchrefract._tensor import expand_batch, in_ranges
 from torchrefract._validation import (
     check_count,
     check_number,
@@ -265,7 +264,7 @@ class _TurbulenceBounds:
         """Return the largest displacement; each pixel has a ray of its own, so the flow is not smooth."""
         focal, _ = pinhole_of(self.camera, height=height, width=width, focal=self.focal)
         largest = _SIGMAS * self.gain * self.tilt[1] * 1e-6 * max(focal)
-        return FlowBounds(largest, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(largest)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave nothing out."""
@@ -276,8 +275,7 @@ class _TurbulenceBounds:
 
     def contains(self, params: PhysicalTurbulenceParams) -> Tensor:
         """Return (), bool: the tilt lies in the range, up to rounding."""
-        low, high = self.tilt
-        return ((params.tilt >= low * (1 - 1e-5)) & (params.tilt <= high * (1 + 1e-5))).all()
+        return in_ranges(params.tilt[:, None], [self.tilt])
 
 
 def road_depth(camera: Camera | None, *, focal: float, height: float | None, horizon: float) -> GroundPlaneDepth:

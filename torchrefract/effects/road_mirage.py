@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import random
+from torchrefract._tensor import in_ranges
 from torchrefract._validation import (
     check_count,
     check_number,
@@ -223,7 +223,7 @@ class _MirageBounds:
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return the largest displacement and slope; the edge is too sharp for a lattice."""
         largest = self.height * width
-        return FlowBounds(2 * largest, 2 + 2 * largest * _STEEPEST, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(2 * largest, 2 + 2 * largest * _STEEPEST)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave nothing out."""
@@ -231,8 +231,4 @@ class _MirageBounds:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: difference and shimmer lie in the ranges, up to rounding."""
-        inside = torch.ones((), dtype=torch.bool, device=params.applied.device)
-        for name in ("difference", "shimmer"):
-            value, (low, high) = getattr(params, name), getattr(self, name)
-            inside = inside & ((value >= low * (1 - 1e-5)) & (value <= high * (1 + 1e-5))).all()
-        return inside
+        return in_ranges(torch.stack([params.difference, params.shimmer], dim=1), [self.difference, self.shimmer])

@@ -1,10 +1,8 @@
 """Turbulent air in front of the camera."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 from torch import Tensor
 
 from torchrefract import random
@@ -293,8 +291,7 @@ class _AtDepthErrorModel:
 
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return the largest displacement; depth has edges, so the flow is not smooth."""
-        largest = self.field.bounds(height, width).max_displacement
-        return FlowBounds(largest, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(self.field.bounds(height, width).max_displacement)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Interpolate the field, and compute its share at every pixel."""

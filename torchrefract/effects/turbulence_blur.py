@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import assume_constant_result, expand_batch
+from torchrefract._tensor import assume_constant_result, expand_batch, in_ranges
 from torchrefract._validation import check_number, check_range, check_within, eager_values, finite_or, requires_grad
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to, per_sample
@@ -26,7 +26,7 @@ from torchrefract.fields.turbulence_blur import (
     halo_px,
     largest_change,
 )
-from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_turbulence_blur
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, plan_turbulence_blur
 from torchrefract.types import Range
 
 TOLERANCE = 0.5  # levels

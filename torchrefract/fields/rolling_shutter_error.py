@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import in_ranges
 from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.fields.depth import DepthProvider, DepthSource
 from torchrefract.types import FlowBounds, Range, Simplification
@@ -21,7 +21,6 @@ _FOURTH = 9 / 16 / 24  # times the fourth derivative and stride^4: error of cubi
 _OFFSETS = 4  # of the lattice, at which errors are measured
 _LARGEST_STRIDE = 128  # px
 _SMALLEST_FRAME = 1 << 14  # pixels
-_ROUNDING = 1e-5  # relative, of drawn values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +76,7 @@ class RollingShutterErrorModel:
             values = values[:, None] if values.ndim == 1 else values
             if values.shape[1] != len(ranges):  # another number of frequencies
                 return torch.zeros((), dtype=torch.bool, device=values.device)
-            low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-            margin = _ROUNDING * torch.maximum(low.abs(), high.abs())
-            inside.append(((values >= low - margin) & (values <= high + margin)).all())
+            inside.append(in_ranges(values, ranges))
         return torch.stack(inside).all()
 
 

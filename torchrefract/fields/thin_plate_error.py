@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from torchrefract._tensor import in_ranges
 from torchrefract.random import LARGEST_NORMAL
 from torchrefract.types import FlowBounds, Range, Simplification
 
@@ -60,9 +61,9 @@ class ThinPlateErrorModel:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: displacements and smoothing are such as can be drawn; points are not compared."""
-        low, high = (end * (1 + sign * 1e-5) for end, sign in zip(self.smoothing, (-1, 1), strict=True))
-        is_smooth = (params.smoothing >= low) & (params.smoothing <= high)
-        return is_smooth.all() & (params.displacement.abs() <= LARGEST_NORMAL * self.amplitude * (1 + 1e-5)).all()
+        largest = LARGEST_NORMAL * self.amplitude
+        is_drawn = in_ranges(params.displacement.reshape(-1, 1), [(-largest, largest)])
+        return is_drawn & in_ranges(params.smoothing[:, None], [self.smoothing])
 
 
 def _max_displacement(model: ThinPlateErrorModel) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import in_ranges
 from torchrefract.fields.random_field import REACH, Frequencies, embedding_size, gaussian_mixture, gradient_rms
 from torchrefract.types import FlowBounds, Range, Simplification
 
@@ -73,10 +73,7 @@ class RandomFieldErrorModel:
         """Return (), bool: amplitude, length and aperture of each sample lie in the ranges, up to rounding."""
         names = ("amplitude", "length") if self.is_stream else ("amplitude", "length", "aperture")
         values = torch.stack([getattr(params, name) for name in names], dim=1)
-        ranges = [getattr(self, name) for name in names]
-        low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-        margin = 1e-5 * torch.maximum(low.abs(), high.abs())
-        return ((values >= low - margin) & (values <= high + margin)).all()
+        return in_ranges(values, [getattr(self, name) for name in names])
 
 
 @lru_cache(maxsize=256)
@@ -91,7 +88,7 @@ def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
             )
             gradient = _NARROW_APERTURE * steep
             gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
-        return FlowBounds(largest, gradient, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(largest, gradient)
 
     def interpolation_error(strides: np.ndarray) -> np.ndarray:
         spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)

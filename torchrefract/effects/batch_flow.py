@@ -102,7 +102,7 @@ class WarpFlow:
         selected = WarpFlow(self.evaluate, params, active, self.plan, has_closed_form=self.has_closed_form)
         if self._field is not None:
             nodes = expand_batch(self._field.nodes, len(self.active))[rows]
-            selected._field = self._field.with_nodes(nodes)
+            selected._field = LatticeFlow(nodes, self._field.lattice)
         return selected
 
 
@@ -322,17 +322,15 @@ class BatchFlow:
     def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
         if len(self.parts) == 1:
             flow = self.parts[0].flow
-            nodes = expand_batch(flow.nodes, image.shape[0])
-            return sample_image(image, flow.with_nodes(nodes), active=active, **options)
+            flow = LatticeFlow(expand_batch(flow.nodes, image.shape[0]), flow.lattice)
+            return sample_image(image, flow, active=active, **options)
         result = torch.empty_like(image)
         frames = image.shape[0] // self.num_rows
         for index, flow, *_ in self.parts:
             assert index is not None  # of several parts
             rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
-            nodes = expand_batch(flow.nodes, len(rows))
-            part = sample_image(
-                image[rows], flow.with_nodes(nodes), active=None if active is None else active[rows], **options
-            )
+            each = LatticeFlow(expand_batch(flow.nodes, len(rows)), flow.lattice)
+            part = sample_image(image[rows], each, active=None if active is None else active[rows], **options)
             # Forward-mode gradients cannot be written into a tensor without any.
             result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
         return result

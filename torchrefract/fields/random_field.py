@@ -359,8 +359,13 @@ def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Moti
     angles = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
     drift = sum(angle.remainder(2 * math.pi).to(noise.dtype) for angle in angles)
     phase = (math.sqrt(2) * motion.frame / motion.decorrelation)[:, None, None].to(noise.dtype) * rates + drift
+    return turn_waves(noise, phase)
+
+
+def turn_waves(values: Tensor, phase: Tensor) -> Tensor:
+    """Multiply waves (N, 2, Ky, Kx), real and imaginary part, by exp(i phase), (N, Ky, Kx)."""
     cos, sin = phase.cos(), phase.sin()
-    real, imaginary = noise.unbind(1)
+    real, imaginary = values.unbind(1)
     return torch.stack([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
 
 

@@ -178,8 +178,8 @@ def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -
     return as_device_tensor(_constant_weights(stride), dtype=dtype, device=device)
 
 
-def lagrange_basis(t: Tensor) -> list[Tensor]:
-    """Evaluate each of the four weights of `lagrange_weights` at any t, in its shape."""
+def lagrange_basis(t: Any) -> list[Any]:
+    """Evaluate each of the four weights of `lagrange_weights` at a number, an array or a tensor t, in its shape."""
     below, above, far = t + 1, t - 1, t - 2
     outer, inner = t * below, above * far
     return [t * inner / -6, below * inner / 2, outer * far / -2, outer * above / 6]

@@ -1,7 +1,7 @@
 """Flows at the nodes of a coarse lattice, with cubics between the nodes."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -63,18 +63,9 @@ class LatticeFlow:
     nodes: Tensor
     lattice: Lattice
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Return the type of the nodes."""
-        return self.nodes.dtype
-
     def detach(self) -> "LatticeFlow":
         """Return the flow without its gradient."""
-        return self.with_nodes(self.nodes.detach())
-
-    def with_nodes(self, nodes: Tensor) -> "LatticeFlow":
-        """Return a flow with other nodes on the same lattice."""
-        return replace(self, nodes=nodes)
+        return LatticeFlow(self.nodes.detach(), self.lattice)
 
     def dense(self) -> Tensor:
         """Return the flow at every pixel, (N, 2, H, W), px."""

@@ -132,9 +132,8 @@ class LensDistortion(WarpEffect):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
-        for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
-            bounds = {"low": -_LARGEST_COEFFICIENT, "high": _LARGEST_COEFFICIENT}
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, **bounds))
+        bounds: dict[str, Range] = dict.fromkeys(POLYNOMIAL12, (-_LARGEST_COEFFICIENT, _LARGEST_COEFFICIENT))
+        self._set_ranges(dict(zip(POLYNOMIAL12, radial + others, strict=True)), bounds)
         self.focal_range = check_range("focal_range", focal_range, low=0.01, high=1000.0)
         self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
         self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
@@ -327,7 +326,7 @@ class LensDistortion(WarpEffect):
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         details = self._constant_plan(id(self), height, width, dtype).details
         with torch.set_grad_enabled(not is_fixed):
-            coefficients, focal, center = (value.double() for value in lens_in_px(params, height, width))
+            coefficients, focal, center = map(Tensor.double, lens_in_px(params, height, width))
             lens = coefficients, focal, center
 
             def position(points: Points) -> Tensor:
@@ -335,16 +334,16 @@ class LensDistortion(WarpEffect):
                 if details is not None and is_fixed:
                     # One more step than for the flow squares the error of its Newton steps.
                     steps = details.steps_for(1) + 1
-                    return pixels + newton_lens_flow(*lens, points, num_steps=steps, terms=used_terms(lens[0]))
+                    return pixels + newton_lens_flow(*lens, points, num_steps=steps, terms=used_terms(coefficients))
                 flow, exists = lens_flow(*lens, points)
                 return torch.where(exists, pixels + flow, torch.nan)
 
-            zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
+            zoom, shift = zoom_to_fill(position, center, height=height, width=width)
         return zoom.to(dtype), (shift / width).to(dtype)
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
-        return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
+        return LensRanges(tuple(map(self._range, POLYNOMIAL12)), *others)
 
     def _report_fold(self, params: LensParams, exists: Tensor, points: Points) -> None:
         folds = eager_values(lambda: params.applied & misses_in_frame(exists, points), of=params.applied)

@@ -20,9 +20,9 @@ from torchrefract._validation import (
     requires_grad,
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
-from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
-from torchrefract.effects.random_field import check_frame
+from torchrefract.effects.random_field import check_frame, frames_of
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.physical_turbulence import (
@@ -238,7 +238,7 @@ class PhysicalTurbulence(WarpEffect):
         may_move = params.frame.shape[1] > 1 or requires_grad((params.frame, params.wind))
         if not may_move and eager_values((params.frame == 0).all, of=params.frame):
             return None
-        frame = finite_or(params.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME).double().reshape(-1, 1)
+        frame = frames_of(params).double()[:, None]
         wind = expand_batch(finite_or(params.wind, 0.0).clamp(-_FASTEST, _FASTEST), len(frame))
         return frame / self.fps * wind.double()
 

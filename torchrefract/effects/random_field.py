@@ -64,6 +64,11 @@ def check_frame(params: Any) -> None:
     check_within("params.frame", params.frame, -LATEST_FRAME, LATEST_FRAME)
 
 
+def frames_of(params: Any) -> Tensor:
+    """Return (B T,), the numbers of the frames, within the bounds of `check_frame`; a NaN counts as frame 0."""
+    return finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
+
+
 def check_field_range(name: str, value: Range) -> Range:
     """Check the range of one of `FIELD_BOUNDS`."""
     low, high = FIELD_BOUNDS[name]
@@ -84,7 +89,7 @@ def motion_of(params: Any) -> Motion:
     rows = params.frame.numel()
     wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
     return Motion(
-        finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME),
+        frames_of(params),
         finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
         torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf),
     )

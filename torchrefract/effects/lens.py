@@ -343,7 +343,7 @@ class LensDistortion(WarpEffect):
 
     def _ranges(self) -> LensRanges:
         others = (self.focal_range, self.aspect_range, self.center_x_range, self.center_y_range)
-        return LensRanges(tuple(map(self._range, POLYNOMIAL12)), *others)
+        return LensRanges(tuple([getattr(self, f"{name}_range") for name in POLYNOMIAL12]), *others)
 
     def _report_fold(self, params: LensParams, exists: Tensor, points: Points) -> None:
         folds = eager_values(lambda: params.applied & misses_in_frame(exists, points), of=params.applied)

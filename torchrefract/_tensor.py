@@ -56,25 +56,6 @@ def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
     return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
-def cached(function: _F) -> _F:
-    """Keep the latest 16 results of a function on the CPU.
-
-    The arguments must be hashable and the last one must be the device. The results must not be written to.
-    """
-
-    @lru_cache(maxsize=16)
-    def once(*args: Any) -> Any:
-        # Tensors made in inference mode cannot be used outside of it.
-        with torch.inference_mode(False), torch.no_grad():
-            return function(*args)
-
-    @wraps(function)
-    def result(*args: Any) -> Any:
-        return (function if torch.compiler.is_compiling() or args[-1].type != "cpu" else once)(*args)
-
-    return cast(_F, result)
-
-
 @contextmanager
 def sharing_results() -> Iterator[None]:
     """Keep the results of `shareable` functions, in this thread, until the end of the block."""

@@ -236,11 +236,8 @@ def params_per_frame(params: Any, frames: int) -> Any:
     """Repeat the parameters of B clips for their T frames: B T rows, each with one frame number."""
     if frames == 1:
         return params
-    if "frame" in params._fields:
-        frame = params.frame.reshape(-1, 1)
-        repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
-        return repeated._replace(frame=frame)
-    return map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+    repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+    return repeated._replace(frame=params.frame.reshape(-1, 1)) if "frame" in params._fields else repeated
 
 
 class ParamsAtDepth(NamedTuple):

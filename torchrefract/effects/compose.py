@@ -129,7 +129,7 @@ class Compose(Effect):
 
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """Return the plan for all parameters in the ranges."""
-        effects, requests = self._flat_effects(), self._requests(height, width, dtype)
+        effects, requests = self._flat_effects(), self._requests(id(self), height, width, dtype)
         plans: dict[int, Any] = {}
         composed: list[CompositionPlan] = []
         error, stretch = 0.0, 1.0
@@ -153,7 +153,7 @@ class Compose(Effect):
     def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
         """Pass the images through all effects."""
         height, width = image.shape[2:]
-        requests = self._constant_requests(id(self), height, width, field_dtype(image.dtype))
+        requests = self._requests(id(self), height, width, field_dtype(image.dtype))
         leaves = self._leaves(params, SamplingOptions())
         progress = Progress(image, depth, len(params.applied))
         together: list[int] = []  # the places of warps that will be sampled together
@@ -272,7 +272,8 @@ class Compose(Effect):
             placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
         return placed
 
-    def _requests(self, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
+    @assume_constant_result
+    def _requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
         """Return for each effect the request of its group of warps, or None if it separates groups.
 
         A photometric effect that may change something separates groups, whatever is drawn, so that a sample does not
@@ -280,10 +281,11 @@ class Compose(Effect):
         """
         effects = self._flat_effects()
         request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).with_reachable_default()
-        requests: list[PlanRequest | None] = [
-            request if isinstance(effect, WarpEffect) or not _may_change(effect, height, width, dtype) else None
-            for effect in effects
-        ]
+        requests: list[PlanRequest | None] = []
+        for effect in effects:
+            is_separator = not isinstance(effect, WarpEffect) and effect.p > 0
+            is_separator = is_separator and not effect.plan_for_dtype(height, width, dtype).is_identity
+            requests.append(None if is_separator else request)
         if request.tolerance_px is None:
             return tuple(requests)
         request.remaining_px()  # raises for an unreachable tolerance
@@ -296,10 +298,6 @@ class Compose(Effect):
                 requests[place] = share
             stretch *= 1 + _plan_group([effects[place] for place in group], share).max_gradient
         return tuple(requests)
-
-    @assume_constant_result
-    def _constant_requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
-        return self._requests(height, width, dtype)
 
     @assume_constant_result
     def _constant_plan(
@@ -363,10 +361,6 @@ def _restrict(params: Any, applied: Tensor) -> Any:
     if isinstance(params, ComposeParams):
         return ComposeParams(params.applied & applied, tuple(_restrict(child, applied) for child in params.children))
     return params._replace(applied=params.applied & applied)
-
-
-def _may_change(effect: Effect, height: int, width: int, dtype: torch.dtype) -> bool:
-    return effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity
 
 
 def _groups(effects: Sequence[Effect], requests: Sequence[PlanRequest | None]) -> list[list[int]]:

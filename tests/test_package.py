@@ -105,6 +105,8 @@ def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
             missing=sorted(train - calibration),
             calls=[("make_board", "out=board.pdf"), ("calibrate", "images=none", "out=a")],
         ),
+        "labels": "import torch; from torchrefract.labels.targets import warp_labels\n"
+        "print(warp_labels({'id': 3}, torch.zeros(2, 4, 5)), 'torchvision' in sys.modules)",
         "restore": WITHOUT.format(
             missing=["diffusers"], calls=[("restore", "ckpt_path=best.ckpt", "input=.", "out=out")]
         ),
@@ -116,6 +118,10 @@ def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
 
 def test_the_package_imports_torch_and_numpy_only(printed):
     assert printed("package") == ("[]\n", "")
+
+
+def test_plain_targets_do_not_import_torchvision(printed):
+    assert printed("labels") == ("{'id': 3} False\n", "")
 
 
 def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_matplotlib(printed):

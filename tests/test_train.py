@@ -96,13 +96,13 @@ def test_a_run_says_on_what_it_trains_before_it_starts(trained):
 
 
 def test_a_network_of_lenses_says_so_for_other_warps(call, small):
-    words = (*(word for word in small if word.startswith("data.")), "trainer.max_epochs=0")
+    words = (*(word for word in small if word.startswith("data.")), "+trainer.max_steps=1")
     haze = call("train", "+task=undistort", "scene=highveld_heat_haze", *words).out
     assert "severity 3; lens_net predicts the flow of a lens alone: add model=resunet for other warps" in haze
 
 
 def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call, small):
-    words = ("+task=deweather", *small, "trainer.max_epochs=0")
+    words = ("+task=deweather", *small, "+trainer.max_steps=1")
     dust = call("train", *words, "scene=unpaved_road", "run_dir=dust").out
     assert "severity 3; it moves pixels too, which deweather does not undo: that takes +task=undistort" in dust
     assert "severity 3\n" in call("train", *words, "scene=cape_town_fog", "run_dir=fog").out

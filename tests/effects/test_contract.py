@@ -559,9 +559,9 @@ def test_a_sample_that_is_not_applied_has_a_gradient_of_the_image_only(case):
     assert of_field[1].any()
 
 
-# Other tests compile turbulence (of a clip), the rolling shutter (all maps of a composition) and heterogeneous fog (its
-# plan); dust is volumetric fog.
-ELSEWHERE = {"turbulence", "turbulence with depth", "rolling shutter", "heterogeneous fog", "volumetric fog"}
+# Other tests compile turbulence (of a clip), the rolling shutter (all maps of a composition), heterogeneous fog (its
+# plan) and flare (in a composition); dust is volumetric fog.
+ELSEWHERE = {"turbulence", "turbulence with depth", "rolling shutter", "heterogeneous fog", "volumetric fog", "flare"}
 
 
 @pytest.mark.parametrize("name", [name for name in EFFECTS if name not in ELSEWHERE])

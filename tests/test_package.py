@@ -3,6 +3,7 @@ import email
 import inspect
 import re
 import runpy
+import sys
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterator
@@ -107,9 +108,6 @@ def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
         ),
         "labels": "import torch; from torchrefract.labels.targets import warp_labels\n"
         "print(warp_labels({'id': 3}, torch.zeros(2, 4, 5)), 'torchvision' in sys.modules)",
-        "restore": WITHOUT.format(
-            missing=["diffusers"], calls=[("restore", "ckpt_path=best.ckpt", "input=.", "out=out")]
-        ),
     }
     outcome = spawn("-W", "error", "-c", FORKED.format(scripts=scripts), cwd=folder)
     assert (outcome.code, outcome.err) == (0, "")
@@ -144,9 +142,13 @@ def test_the_calibration_extra_suffices_for_calibration(printed):
     assert err.startswith("error: images must be an existing folder of pictures, got none")
 
 
-def test_restoring_without_diffusers_names_the_extra(printed):
-    message = "error: restore needs diffusers, which is not installed: pip install 'torchrefract[train]'\n"
-    assert printed("restore")[1] == message
+def test_restoring_without_diffusers_names_the_extra(call, monkeypatch):
+    for name in ("diffusers", "diffusers.optimization"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in ("torchrefract.cli.restoration", "torchrefract.restoration.module"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    message = "restore needs diffusers, which is not installed: pip install 'torchrefract[train]'"
+    assert call("restore", "ckpt_path=best.ckpt", "input=.", "out=out").message == message
 
 
 def test_a_command_speaks_before_it_imports_torch(spawn, tmp_path):

@@ -98,12 +98,12 @@ class Frames(Dataset):
 """
 
 
-def test_spawned_workers_give_the_samples_of_this_process(tmp_path: Path, monkeypatch):
+def test_a_spawned_worker_gives_the_samples_of_this_process(tmp_path: Path, monkeypatch):
     effects, images = {name: make() for name, make in EFFECTS.items()}, random_frames(3, 3)
     (tmp_path / "spawned_frames.py").write_text(SPAWNED)
     monkeypatch.syspath_prepend(tmp_path)
     frames = importlib.import_module("spawned_frames").Frames(list(effects.values()), images)
-    samples = list(DataLoader(frames, batch_size=None, num_workers=2, multiprocessing_context="spawn"))
+    samples = list(DataLoader(frames, batch_size=None, num_workers=1, multiprocessing_context="spawn"))
     for n, (name, effect) in enumerate(effects.items()):
         rows = samples[n * len(images) : (n + 1) * len(images)]
         together = effect.degrade(images, seed=7, keys=[2**40 + k for k in range(len(images))])

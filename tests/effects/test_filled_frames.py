@@ -32,7 +32,7 @@ def at_least(value: Tensor | None) -> Tensor:
 
 @pytest.mark.parametrize("severity", presets.SEVERITIES)
 def test_no_pixel_of_10000_drawn_lenses_is_without_a_source(severity):
-    d = presets.cheap_dashcam(severity).degrade(torch.zeros(2000, 1, 18, 32), seed=severity)
+    d = presets.cheap_dashcam(severity).degrade(torch.zeros(2000, 1, 27, 48), seed=severity)
     assert d.valid.all()
     assert d.params.zoom.max() <= 1
 

@@ -35,7 +35,7 @@ def rendered_small() -> list[tuple[str, np.ndarray]]:
 
 
 @pytest.fixture
-def pictures(tmp_path, rendered_small) -> Path:
+def pictures(tmp_path, rendered_small, blank_figures) -> Path:
     """Write six pictures of a board below the folder in which commands run."""
     (tmp_path / "pictures").mkdir()
     for name, gray in rendered_small:
@@ -80,6 +80,7 @@ def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatc
     }
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_camera_of_the_division_model_is_recovered_written_and_rectifies(call, tmp_path):
     exact = replace(SMALL, coefficients=(-0.25,), model="division")
     (tmp_path / "pictures").mkdir()
@@ -109,6 +110,7 @@ def test_views_of_a_still_board_count_once(call, pictures, rendered_small):
     assert f"shows the board where {rendered_small[0][0]} does" in read_report(pictures.parent)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_pictures_that_were_turned_before_they_were_saved_are_warned_of(call, tmp_path):
     (tmp_path / "pictures").mkdir()
     for k, (name, gray, _) in enumerate(render_views(BOARD, replace(SMALL, cx=360.0, cy=165.0), count=6)):
@@ -247,6 +249,7 @@ def test_invalid_options_are_one_line_of_error(call, options, message):
     assert re.search(message, call("calibrate", *options).message)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_data, tmp_path):
     board = ("squares=4x5", "square_mm=54", "marker_mm=40.5", "dictionary=DICT_4X4_1000")
     folder = shared_data / "charuco" / "caliscope_cam0"
@@ -268,6 +271,7 @@ def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_d
     assert covariance.shape == (4 + len(camera.coefficients),) * 2
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_real_pictures_give_the_camera_of_opencv(call, shared_data, tmp_path):
     folder = shared_data / "charuco" / "opencv_tutorial"
     options = ("squares=5x7", "marker_mm=11", "dictionary=DICT_6X6_250", "lens_model=opencv5", "out=out")

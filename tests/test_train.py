@@ -25,6 +25,7 @@ from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkp
 from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.module import Restoration
 
+pytestmark = pytest.mark.usefixtures("blank_figures")  # `trained`, a process of its own, draws them
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
 DDPM = (
     "model=ddpm_image",

@@ -24,14 +24,22 @@ from torchrefract._validation import (
     check_count,
     check_flag,
     check_number,
-    check_positive,
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
-from torchrefract.cli.place import place_scene
-from torchrefract.cli.stores import check_memory, disk_errors
-from torchrefract.data.depth_maps import DepthFolder
+from torchrefract.cli.command import check_none_lost, warn_of_assumed_depth
+from torchrefract.cli.options import (
+    check_memory,
+    check_seed,
+    depth_folder,
+    disk_errors,
+    make_effect,
+    naming,
+    place_scene,
+    read_option,
+    read_optional,
+    read_workers,
+)
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.data.pairs.card import summarize, write_card
@@ -57,8 +65,7 @@ from torchrefract.data.pairs.manifest import (
 from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
 from torchrefract.data.pairs.table import PairTable
-from torchrefract.data.workers import map_in_processes, num_cores
-from torchrefract.effects.base import Effect
+from torchrefract.data.workers import map_in_processes
 
 _T = TypeVar("_T")
 
@@ -169,27 +176,26 @@ def _is_repaired(row: PairRow, options: Options) -> bool:
 
 
 def _parse(cfg: DictConfig, out: Path) -> Options:
-    camera = place_scene(cfg, size=None if cfg.size is None else _checked(cfg, "size", check_size))
-    effect = make(cfg, "scene")
-    if not isinstance(effect, Effect):
-        raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
+    size = read_optional(cfg, "size", check_size)
+    camera = place_scene(cfg, size=size)
+    effect = make_effect(cfg, "scene")
     if check_seed(cfg.seed) >= _SEED_END:
         raise UsageError(f"seed must be below {_SEED_END}, got {cfg.seed}")
     plain: dict[str, Any] = {
         "seed": cfg.seed,
-        "maps": _checked(cfg, "maps", check_choice, choices=FORMATS),
-        "drive_by": _checked(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
-        "size": None if cfg.size is None else _checked(cfg, "size", check_size),
-        "tar": None if cfg.tar is None else _checked(cfg, "tar", check_count),
-        "every": _checked(cfg, "every", check_count),
-        "val_share": _checked(cfg, "val_share", check_number),
+        "maps": read_option(cfg, "maps", check_choice, choices=FORMATS),
+        "drive_by": read_option(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
+        "size": size,
+        "tar": read_optional(cfg, "tar", check_count),
+        "every": read_option(cfg, "every", check_count),
+        "val_share": read_option(cfg, "val_share", check_number),
     }
     engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
     with naming("device"):
         plain["device"] = choose_device(cfg.device, engine)
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
-    verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
+    verify, shard, workers = read_option(cfg, "verify", check_flag), _shard(cfg), read_workers(cfg)
     if engine["name"] == "ray" and workers == 0:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     if engine["name"] == "ray" and engine["address"]:
@@ -201,16 +207,12 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
         raise UsageError("license must be that of the source, in words, got nothing")
-    count = None if cfg.count is None else _checked(cfg, "count", check_count)
+    count = read_optional(cfg, "count", check_count)
     listed, write_list = _list_frames(cfg, source, out, plain)
     num_pairs = listed.num_frames if count is None else count
     sources = listed.limited(num_pairs)
-    depth = None
-    if cfg.depth is not None:
-        with naming("depth"):
-            folder = as_path(str(cfg.depth))
-        check_memory(workers, depth=folder)
-        depth = DepthFolder(folder, _checked(cfg, "depth_scale", check_positive))
+    if (depth := depth_folder(cfg)) is not None:
+        check_memory(workers, depth=depth.root)
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
@@ -257,11 +259,6 @@ def _list_frames(
     return sources, lambda: sources.write(path, options)
 
 
-def _checked(cfg: DictConfig, name: str, check: Callable[..., _T], **limits: Any) -> _T:
-    with naming(name):
-        return check(name, cfg[name], **limits)
-
-
 def _shard(cfg: DictConfig) -> Shard:
     """Return the shard of the options, by default torchrun's rank."""
     if (cfg.shard is None) != (cfg.shards is None):
@@ -273,12 +270,6 @@ def _shard(cfg: DictConfig) -> Shard:
     if number >= total:
         raise UsageError(f"shard must be below shards = {total}, got {number}")
     return Shard(number, total)
-
-
-def _workers(cfg: DictConfig) -> int:
-    if cfg.workers is not None:
-        return _checked(cfg, "workers", check_count, low=0)
-    return num_cores()
 
 
 def _report(options: Options, complete: set[int], damaged: int) -> None:

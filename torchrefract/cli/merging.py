@@ -10,9 +10,8 @@ from omegaconf import DictConfig
 
 from torchrefract._io import as_path, read_bytes, remove_file
 from torchrefract._validation import UsageError, check_flag, first_names
-from torchrefract.cli.command import naming
 from torchrefract.cli.generation import list_unreadable
-from torchrefract.cli.stores import disk_errors
+from torchrefract.cli.options import disk_errors, naming, read_option
 from torchrefract.data.images import opened
 from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.configuration import check_shards, shard_configs
@@ -24,7 +23,7 @@ def merge(cfg: DictConfig) -> None:
     """Join the manifests of a set; raise UsageError if it lacks a pair, or has one twice or of other options."""
     with naming("out"):
         out = as_path(str(cfg.out))
-    verify = check_flag("verify", cfg.verify)
+    verify = read_option(cfg, "verify", check_flag)
     settings, count, license_text = _configuration(out)
     with disk_errors(out), locked_shard(out, 0, 1):
         count = check_shards(out, settings, count)

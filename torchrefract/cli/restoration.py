@@ -25,10 +25,18 @@ from torch import Tensor
 from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
+from torchrefract.cli.command import check_none_lost, print_warning, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
-from torchrefract.cli.place import place_scene
+from torchrefract.cli.options import (
+    check_seed,
+    find_device,
+    make,
+    naming,
+    place_scene,
+    read_option,
+    read_optional,
+)
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
@@ -164,7 +172,7 @@ def restore(cfg: DictConfig) -> None:
 def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     todo = [file for file in files if not job.is_done(file)]
     for loss in describe_losses(todo, upright=True):
-        print(f"warning: {loss}", file=sys.stderr)
+        print_warning(loss)
     start = time.perf_counter()
     failed = dict[Path, UnreadableImageError]()
     num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
@@ -321,12 +329,8 @@ class _Job(NamedTuple):
 
 
 def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
-    with naming("batch"):
-        batch = check_count("batch", cfg.batch)
-    with naming("side_by_side"):
-        side_by_side = check_flag("side_by_side", cfg.side_by_side)
-    with naming("deviation"):
-        deviation = check_flag("deviation", cfg.deviation)
+    batch = read_option(cfg, "batch", check_count)
+    side_by_side, deviation = (read_option(cfg, name, check_flag) for name in ("side_by_side", "deviation"))
     device = find_device(str(cfg.device))
     loaded = load_model(str(cfg.ckpt_path), changes=cfg.model)
     if deviation and (cfg.pool == "lens" or not loaded.model.has_deviation):
@@ -334,8 +338,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
             "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at "
             f"least two samples, got true for {loaded.name}"
         )
-    with naming("size"):
-        size = loaded.size if cfg.size is None else check_size("size", cfg.size)
+    size = read_optional(cfg, "size", check_size) or loaded.size
     with naming("tile"):
         sides = (cfg.tile, cfg.tile) if isinstance(cfg.tile, int) else cfg.tile
         tile = None if sides is None else check_size("tile", sides)

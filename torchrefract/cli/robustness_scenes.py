@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import naming
+from torchrefract.cli.options import naming
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import Level
 from torchrefract.robustness.predictors import import_function

@@ -1,7 +1,6 @@
 """The stored scores of a run of the command robustness, by which it continues, and beside which another is compared."""
 
 import json
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ import torchrefract
 from torchrefract import presets
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, first_names
+from torchrefract.cli.command import print_warning
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
 from torchrefract.robustness.quantities import QUANTITIES
 
@@ -75,7 +75,7 @@ def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> 
     version = (before.get("versions") or {}).get("torchrefract", "of an unknown version")
     if version != torchrefract.__version__:
         text = f"torchrefract {version}, this is {torchrefract.__version__}: its pictures may differ"
-        print(f"warning: base was run with {text}", file=sys.stderr)
+        print_warning(f"base was run with {text}")
     levels, of_images = next(iter(scored.values())).levels, scored.values()
     result = Robustness(
         names=list(scored),
@@ -92,7 +92,7 @@ def _check_versions(before: Mapping[str, str]) -> None:
     version = before.get("torchrefract")
     if version is None:
         text = f"an unknown version of torchrefract and continues with {torchrefract.__version__}: draws may differ"
-        print(f"warning: out was begun by {text}", file=sys.stderr)
+        print_warning(f"out was begun by {text}")
     elif version != torchrefract.__version__:
         raise UsageError(
             f"out must be a folder of a run of torchrefract {torchrefract.__version__}, got one of {version}, whose "
@@ -100,7 +100,7 @@ def _check_versions(before: Mapping[str, str]) -> None:
         )
     elif before["torch"] != torch.__version__:
         text = f"{before['torch']} and continues with {torch.__version__}: last digits may differ"
-        print(f"warning: out was begun with torch {text}", file=sys.stderr)
+        print_warning(f"out was begun with torch {text}")
 
 
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:

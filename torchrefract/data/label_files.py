@@ -22,10 +22,9 @@ from torchrefract._validation import UsageError, first_names
 from torchrefract.data.coco import Annotation, decompressed, problem_of
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import image_header, opened
-from torchrefract.labels.boxes import warp_boxes
+from torchrefract.labels.boxes import polygon_area, warp_boxes, warp_polygons
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
-from torchrefract.labels.polygons import polygon_area, warp_polygons
 
 _SUFFIXES = (".txt", ".png")  # of YOLO and masks
 _SIMPLIFICATION_PX = 0.02  # largest distance between a warped outline and the polygon that is written

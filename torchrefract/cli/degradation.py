@@ -40,7 +40,6 @@ from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.frames import drives_of
 from torchrefract.data.images import is_lost, local_copy, pixels_of, read_image
-from torchrefract.data.label_boxes import category_names, labeled_boxes
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -48,6 +47,8 @@ from torchrefract.data.label_files import (
     LabelFolder,
     MovedLabels,
     PictureLabels,
+    category_names,
+    labeled_boxes,
     read_labels,
 )
 from torchrefract.data.pairs.configuration import claim

@@ -38,13 +38,14 @@ from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_frame_of_camera, read_image
-from torchrefract.data.label_boxes import boxes_of_coco, boxes_of_yolo
 from torchrefract.data.label_files import (
     CocoLabels,
     LabelFolder,
     MaskFile,
     PictureLabels,
     YoloFile,
+    boxes_of_coco,
+    boxes_of_yolo,
     read_labels,
 )
 from torchrefract.data.pairs.manifest import locked

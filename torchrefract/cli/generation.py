@@ -64,7 +64,6 @@ from torchrefract.data.pairs.manifest import (
 )
 from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
-from torchrefract.data.pairs.table import PairTable
 from torchrefract.data.workers import map_in_processes
 
 _T = TypeVar("_T")
@@ -337,14 +336,12 @@ def _with_progress(units: Iterable[list[PairRow]], *, total: int) -> Iterator[li
 def _finish(options: Options, out: Path, *, num_made: int) -> None:
     """Write the card if all shards have finished, and print the last line."""
     rows = scan_rows(find_manifests(out), lambda row: row.number < options.num_pairs, skip_invalid=True)
-    table = PairTable(options.settings)
-    summary = summarize(table.collect(row for row, _ in rows))
+    summary = summarize((row for row, _ in rows), settings=options.settings)
     num_complete, num_skipped = summary.splits.total(), len(summary.skipped)
     missing = options.num_pairs - num_complete - num_skipped
     if num_complete == 0 and not missing:
         raise UsageError(f"source must hold readable frames, got {summary.skipped[0]}")
     if not missing:
-        table.write(out)
         write_card(out, summary, settings=options.settings, license_text=options.license)
     rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""

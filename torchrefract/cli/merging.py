@@ -16,7 +16,6 @@ from torchrefract.data.images import opened
 from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.configuration import check_shards, shard_configs
 from torchrefract.data.pairs.manifest import Manifest, find_manifests, locked_shard, scan_rows
-from torchrefract.data.pairs.table import PairTable
 
 
 def merge(cfg: DictConfig) -> None:
@@ -32,8 +31,8 @@ def merge(cfg: DictConfig) -> None:
         manifest = Manifest(out, 0, 1)
         complete, _ = manifest.open(lambda number: number < count, verify=verify, is_repaired=lambda _: False)
         draws = Counter((row.seed, row.key) for row, _ in scan_rows([manifest.path], lambda row: not row.skipped))
-        table = PairTable(settings)
-        summary = summarize(table.collect(row for row, _ in scan_rows([manifest.path], lambda _: True)))
+        rows = (row for row, _ in scan_rows([manifest.path], lambda _: True))
+        summary = summarize(rows, settings=settings)
         list_unreadable(summary.skipped)
         print(
             f"{out}: {summary.splits.total()} of {count} pairs, {len(summary.skipped)} frames are unreadable, "
@@ -46,7 +45,6 @@ def merge(cfg: DictConfig) -> None:
             )
         if repeated := [str(key) for (_, key), times in draws.items() if times > 1]:
             raise UsageError(f"out must hold each draw once, got pairs that share the keys {first_names(repeated)}")
-        table.write(out)
         write_card(out, summary, settings=settings, license_text=license_text)
         for path in shard_configs(out):
             remove_file(path)

@@ -17,7 +17,7 @@ needs quotes, as in `'out=my pairs'`.
 
 from torchrefract.cli.entry import command
 
-main = command("merge", __doc__, "merging:merge")
+main = command("merge", __doc__, "generation:merge")
 
 if __name__ == "__main__":
     main()

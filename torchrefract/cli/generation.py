@@ -1,9 +1,11 @@
-"""The command that writes pairs to disk: its options, its output folder, its progress and its last line."""
+"""The commands `generate`, which writes pairs to disk, and `merge`, which joins the manifests of its shards."""
 
+import json
 import os
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -17,7 +19,7 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from torchrefract._io import as_path, is_remote, make_folder
+from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
 from torchrefract._validation import (
     UsageError,
     check_choice,
@@ -38,12 +40,13 @@ from torchrefract.cli.options import (
     place_scene,
     read_option,
     read_optional,
+    read_path,
     read_workers,
 )
 from torchrefract.data.frames import Source
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.card import summarize, write_card
-from torchrefract.data.pairs.configuration import claim, shard_suffix
+from torchrefract.data.pairs.configuration import check_shards, claim, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -115,8 +118,7 @@ class Options(NamedTuple):
 
 def generate(cfg: DictConfig) -> None:
     """Write the missing pairs of a shard, and the card when the set is complete."""
-    with naming("out"):
-        out = as_path(str(cfg.out))
+    out = read_path(cfg, "out")
     with disk_errors(out):
         make_folder(out)
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
@@ -199,8 +201,7 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     if engine["name"] == "ray" and engine["address"]:
         check_cluster(str(engine["address"]))
-    with naming("source"):
-        source = as_path(str(cfg.source))
+    source = read_path(cfg, "source")
     check_memory(workers, out=out, source=source)
     if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
@@ -345,13 +346,75 @@ def _finish(options: Options, out: Path, *, num_made: int) -> None:
         write_card(out, summary, settings=options.settings, license_text=options.license)
     rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""
-    list_unreadable(summary.skipped)
+    _list_unreadable(summary.skipped)
     print(f"{out}: {num_made} pairs made, {num_complete} in total{skipped}; {rest}")
 
 
-def list_unreadable(reasons: Sequence[str]) -> None:
+def _list_unreadable(reasons: Sequence[str]) -> None:
     """Print the reasons of frames without a pair."""
     for reason in reasons[:_SHOWN]:
         print(f"unreadable, tried again by the same command: {reason}")
     if len(reasons) > _SHOWN:
         print(f"and {len(reasons) - _SHOWN} more, which the manifest names")
+
+
+def merge(cfg: DictConfig) -> None:
+    """Join the manifests of a set; raise UsageError if it lacks a pair, or has one twice or of other options."""
+    out = read_path(cfg, "out")
+    verify = read_option(cfg, "verify", check_flag)
+    settings, count, license_text = _configuration(out)
+    with disk_errors(out), locked_shard(out, 0, 1):
+        count = check_shards(out, settings, count)
+        num_rows = _count_lines(out)
+        _check_configuration(out, settings, count)
+        manifest = Manifest(out, 0, 1)
+        complete, _ = manifest.open(lambda number: number < count, verify=verify, is_repaired=lambda _: False)
+        draws = Counter((row.seed, row.key) for row, _ in scan_rows([manifest.path], lambda row: not row.skipped))
+        rows = (row for row, _ in scan_rows([manifest.path], lambda _: True))
+        summary = summarize(rows, settings=settings)
+        _list_unreadable(summary.skipped)
+        print(
+            f"{out}: {summary.splits.total()} of {count} pairs, {len(summary.skipped)} frames are unreadable, "
+            f"{num_rows - len(complete)} rows dropped that repeat others or lack their files"
+        )
+        if missing := [str(number) for number in range(count) if number not in complete]:
+            raise UsageError(
+                f"out must hold {count} pairs, got {len(missing)} missing: {first_names(missing)}; the same commands "
+                "of generate make them"
+            )
+        if repeated := [str(key) for (_, key), times in draws.items() if times > 1]:
+            raise UsageError(f"out must hold each draw once, got pairs that share the keys {first_names(repeated)}")
+        write_card(out, summary, settings=settings, license_text=license_text)
+        for path in shard_configs(out):
+            remove_file(path)
+
+
+def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
+    """Return the settings, the number of pairs and the license in config.json."""
+    try:
+        document = json.loads(read_bytes(out / "config.json"))
+        settings = document["settings"]
+        _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
+        return settings, int(document["count"]), str(document["license"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error
+
+
+def _check_configuration(out: Path, settings: Mapping[str, Any], count: int) -> None:
+    """Raise UsageError if rows are of another seed or scene, as of shards that were copied without their options."""
+    rows = (row for row, _ in scan_rows(find_manifests(out), lambda row: row.number < count, skip_invalid=True))
+    expected = settings["scene"]["name"], settings["seed"]
+    # The seed of a draw holds that of the set in its upper bits, see `draw_of`.
+    if other := [str(row.number) for row in rows if (row.scene, row.seed >> 32) != expected]:
+        raise UsageError(
+            f"out must hold pairs of one configuration, got {len(other)} of another seed or scene: "
+            f"{first_names(sorted(other, key=int))}; make each set in a folder of its own"
+        )
+
+
+def _count_lines(out: Path) -> int:
+    count = 0
+    for path in find_manifests(out):
+        with opened(path) as stream:
+            count += sum(1 for _ in stream)
+    return count

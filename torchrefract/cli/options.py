@@ -66,6 +66,12 @@ def read_workers(cfg: DictConfig) -> int:
     return num_cores() if workers is None else workers
 
 
+def read_path(cfg: DictConfig, name: str) -> Path:
+    """Return the path or the address that an option gives, see `as_path`."""
+    with naming(name):
+        return as_path(str(cfg[name]))
+
+
 def check_seed(seed: Any) -> int:
     """Return `seed` if NumPy and PyTorch accept it."""
     if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
@@ -114,9 +120,7 @@ def depth_folder(cfg: DictConfig) -> DepthFolder | None:
     """Return the folder of depth maps that the options `depth` and `depth_scale` give; None without one."""
     if cfg.depth is None:
         return None
-    scale = read_option(cfg, "depth_scale", check_positive)
-    with naming("depth"):
-        return DepthFolder(as_path(str(cfg.depth)), scale)
+    return DepthFolder(read_path(cfg, "depth"), read_option(cfg, "depth_scale", check_positive))
 
 
 def read_place(cfg: DictConfig) -> dict[str, Any]:
@@ -166,10 +170,7 @@ def place_scene(cfg: DictConfig, *, size: Sequence[int] | None = None) -> Camera
 @contextmanager
 def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
     """Yield the paths or addresses of the options `source` and `out`; errors of a store for `out` become one line."""
-    with naming("source"):
-        source = as_path(str(cfg.source))
-    with naming("out"):
-        out = as_path(str(cfg.out))
+    source, out = read_path(cfg, "source"), read_path(cfg, "out")
     with disk_errors(out) if is_remote(out) else nullcontext():
         yield source, out
 

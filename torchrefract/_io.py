@@ -178,3 +178,12 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: str | bytes, *, alone: bool = False) -> None:
+    """Replace a file by a text in UTF-8, or by bytes; see `replace_file`."""
+    with replace_file(path, alone=alone) as temporary:
+        if isinstance(content, str):
+            temporary.write_text(content, encoding="utf-8")
+        else:
+            temporary.write_bytes(content)

@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
@@ -248,11 +248,9 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     if not marker.is_file() or marker.read_text(encoding="utf-8") != content:
         folder.mkdir(exist_ok=True)
         for name, picture, _ in progress(render_views(board), "rendering", count=NUM_VIEWS):
-            _, encoded = cv2.imencode(".png", picture)
-            with replace_file(folder / name) as path:
-                path.write_bytes(encoded.tobytes())  # cv2.imwrite would not say that a disk is full
-        with replace_file(marker) as path:
-            path.write_text(content, encoding="utf-8")
+            # cv2.imwrite would not say that a disk is full.
+            write_file(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+        write_file(marker, content)
     return find_pictures(folder)
 
 

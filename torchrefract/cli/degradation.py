@@ -20,7 +20,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store
+from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
 from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
@@ -232,8 +232,7 @@ def _by_number(name: str) -> list[str | int]:
 
 def _write(path: Path, data: bytes) -> None:
     make_folder(path.parent)
-    with replace_file(path, alone=True) as temporary:
-        temporary.write_bytes(data)
+    write_file(path, data, alone=True)
 
 
 @contextmanager

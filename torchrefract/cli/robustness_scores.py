@@ -11,7 +11,7 @@ import torch
 
 import torchrefract
 from torchrefract import presets
-from torchrefract._io import replace_file
+from torchrefract._io import write_file
 from torchrefract._validation import UsageError, first_names
 from torchrefract.cli.command import print_warning
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
@@ -41,8 +41,7 @@ def stored_scores(
             )
         _check_versions(before.get("versions") or {})
     done = dict(map(parse_scores, lines[1:]))
-    with replace_file(path, alone=True) as repaired:
-        repaired.write_text("".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", encoding="utf-8")
+    write_file(path, "".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", alone=True)
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import is_remote, local_file, relative_name, replace_file, sizes_in_store
+from torchrefract._io import is_remote, local_file, relative_name, sizes_in_store, write_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import fit, image_size, local_copy
 from torchrefract.fields.depth import check_depth
@@ -94,8 +94,7 @@ class DepthFolder:
 
 def write_depth(path: Path, depth: Tensor) -> None:
     """Write a map (H, W), m, as a PNG of 16 bits in steps of 1/256 m; from 256 m on, it is infinite."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", depth_levels(depth.numpy()))[1].tobytes())
+    write_file(path, cv2.imencode(".png", depth_levels(depth.numpy()))[1].tobytes())
 
 
 def depth_levels(depth: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._io import as_path, replace_file
+from torchrefract._io import as_path, write_file
 
 if TYPE_CHECKING:
     from torchrefract.restoration.checkpoints import Loaded
@@ -75,8 +75,7 @@ def write_weights(checkpoint: Mapping[str, Any], out: Path) -> None:
     values = {name: _in_half(value) for name, value in (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()}
     config = {part: checkpoint["config"][part] for part in _CONFIG if part in checkpoint["config"]}
     about = {part: checkpoint[part] for part in _PARTS} | {"config": config, "crc32": _checksum(values)}
-    with replace_file(out) as temporary:
-        temporary.write_bytes(save(values, metadata={_METADATA: json.dumps(about)}))
+    write_file(out, save(values, metadata={_METADATA: json.dumps(about)}))
 
 
 def read_weights(path: Path) -> dict[str, Any]:

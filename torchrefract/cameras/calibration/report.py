@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.choice import AUTO, FOLDS, Candidate, choose_model
 from torchrefract.cameras.calibration.detection import Detection, View
@@ -117,7 +117,7 @@ def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray
     for name, figure in zip(_FIGURES, figures, strict=True):
         with replace_file(folder / name) as path:
             figure.savefig(path)
-    _write(folder / REPORT_FILE, _report(calibration))
+    write_file(folder / REPORT_FILE, _report(calibration) + "\n")
 
 
 def write_failure(board: Board, detections: Sequence[Detection], problem: str, folder: Path) -> None:
@@ -132,16 +132,11 @@ def write_failure(board: Board, detections: Sequence[Detection], problem: str, f
     if _earlier(folder / CAMERA_FILE).is_file():
         text += f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.\n\n"
     rows = [(d.view.name, str(len(d.view.ids)), d.problem) for d in detections]
-    _write(folder / REPORT_FILE, text + _table(("picture", "corners", "problem"), rows))
+    write_file(folder / REPORT_FILE, text + _table(("picture", "corners", "problem"), rows) + "\n")
 
 
 def _earlier(path: Path) -> Path:
     return path.with_name(f"{path.stem}_before{path.suffix}")
-
-
-def _write(path: Path, text: str) -> None:
-    with replace_file(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def _report(calibration: Calibration) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.data.pairs.manifest import PairRow
 
@@ -90,13 +90,10 @@ def summarize(rows: Iterable[PairRow], *, settings: Mapping[str, Any]) -> Summar
 def write_card(out: Path, summary: Summary, *, settings: Mapping[str, Any], license_text: str) -> None:
     """Write the card, its figure and the table into the folder of a set; several shards may do so at the same time."""
     summary.table.write(out)
-    files, figure = dict[str, bytes](), draw_histograms(summary)
-    if figure is not None:
-        files[HISTOGRAMS] = figure
+    if (figure := draw_histograms(summary)) is not None:
+        write_file(out / HISTOGRAMS, figure)
     card = format_card(summary, settings=settings, license_text=license_text, has_histograms=figure is not None)
-    for name, data in (files | {"README.md": card.encode()}).items():
-        with replace_file(out / name) as temporary:
-            temporary.write_bytes(data)
+    write_file(out / "README.md", card.encode())
 
 
 def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:

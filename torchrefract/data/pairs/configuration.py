@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrefract._io import make_folder, matching_files, read_bytes, remove_file, replace_file
+from torchrefract._io import make_folder, matching_files, read_bytes, remove_file, write_file
 from torchrefract._validation import UsageError
 
 CONFIG = "config.json"
@@ -64,8 +64,7 @@ def claim(
     document = {"settings": new, "count": count, **about}
     for target in (path, path.with_name(f"config{suffix}.json")) if suffix else (path,):
         if document != previous or not target.is_file():
-            with replace_file(target) as temporary:
-                temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+            write_file(target, json.dumps(document, indent=2) + "\n")
     return previous
 
 

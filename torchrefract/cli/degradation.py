@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import sys
 import time
 import warnings
@@ -39,7 +38,7 @@ from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.frames import drives_of
-from torchrefract.data.images import is_lost, local_copy, pixels_of, read_image
+from torchrefract.data.images import is_lost, local_copy, natural_order, pixels_of, read_image
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -220,14 +219,9 @@ def _shots(cfg: DictConfig, pictures: Sequence[str]) -> dict[str, _Shot] | None:
     with naming("drive_by"):
         drive_of = drives_of([*pictures], check_choice("drive_by", cfg.drive_by, ("auto", "folder", "prefix")))
     clips: dict[str, list[str]] = {}
-    for name in sorted(pictures, key=_by_number):
+    for name in sorted(pictures, key=natural_order):
         clips.setdefault(drive_of[name], []).append(name)
     return {name: _Shot(drive, clip[0], t) for drive, clip in clips.items() for t, name in enumerate(clip)}
-
-
-def _by_number(name: str) -> list[str | int]:
-    """Return the key that sorts 2.png before 10.png."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def _write(path: Path, data: bytes) -> None:

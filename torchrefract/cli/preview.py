@@ -1,6 +1,5 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,7 @@ from torchrefract._validation import UsageError, check_count, check_number, chec
 from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
 from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
-from torchrefract.data.images import EXTENSIONS, files_in, fit, read_image
+from torchrefract.data.images import EXTENSIONS, files_in, fit, natural_order, read_image
 from torchrefract.data.media import VIDEOS, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -108,7 +107,7 @@ def _source(cfg: DictConfig) -> _Source:
 def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_MapName]]:
     """Return the first frames of a folder or a video, or a picture that repeats, and names of their depth maps."""
     if path.is_dir():
-        files = sorted(files_in(path), key=_natural_order)[:max_frames]
+        files = sorted(files_in(path), key=lambda file: natural_order(file.name))[:max_frames]
         if not files:
             raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
         maps = [(file.name, None) for file in files]
@@ -124,11 +123,6 @@ def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_
 
 def _repeat(image: Tensor, num_frames: int) -> FrameSequence:
     return FrameSequence(num_frames, lambda times: ((t, image) for t in times))
-
-
-def _natural_order(path: Path) -> list[str | int]:
-    """Return a sort key by which frame 2 comes before frame 10."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 
 def _read_folder(files: list[Path], times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:

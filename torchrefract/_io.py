@@ -1,6 +1,7 @@
 """Paths on this machine and in object stores, atomic file writes, and the folder of the configuration files."""
 
 import errno
+import hashlib
 import logging
 import os
 import re
@@ -95,6 +96,12 @@ def read_bytes(path: Path) -> bytes:
     if not is_remote(path):
         return path.read_bytes()
     return retried(lambda: store_of(path).cat_file(cast(Any, path).path), path)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 digest of a file on this machine."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def matching_files(folder: Path, pattern: str) -> list[Path]:

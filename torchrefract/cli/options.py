@@ -1,7 +1,6 @@
 """Options of the commands as values: numbers, paths, devices, scenes, and how the frames were taken."""
 
 import errno
-import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -15,7 +14,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from torchrefract._io import as_path, is_remote
+from torchrefract._io import as_path, file_digest, is_remote
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
@@ -92,11 +91,7 @@ def find_device(name: str) -> torch.device:
 def file_digests(values: Iterable[Any]) -> dict[str, str] | None:
     """Return the SHA-256 digests of the files that are among the values of options, by path; None without any."""
     paths = [value for value in values if isinstance(value, str) and os.path.isfile(value)]
-    digests = dict[str, str]()
-    for path in paths:
-        with open(path, "rb") as stream:
-            digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return digests or None
+    return {path: file_digest(Path(path)) for path in paths} or None
 
 
 def make(cfg: DictConfig, part: str) -> Any:

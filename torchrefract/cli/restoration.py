@@ -1,6 +1,5 @@
 """The commands `train` and `eval`, and those that apply a model: `restore` writes pictures, `export` a program."""
 
-import hashlib
 import math
 import os
 import signal
@@ -22,7 +21,7 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
+from torchrefract._io import as_path, file_digest, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, print_warning, progress
@@ -374,10 +373,8 @@ def _check_maps(files: Sequence[Path], job: _Job) -> None:
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
     """Return everything that decides the output, so that a folder is only continued with the same settings."""
-    with find_checkpoint(str(cfg.ckpt_path)).open("rb") as stream:
-        checkpoint = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
-        "checkpoint": checkpoint,
+        "checkpoint": file_digest(find_checkpoint(str(cfg.ckpt_path))),
         "input": str(job.source.resolve()),
         "size": list(job.restorer.size),
         "tile": job.restorer.tile and list(job.restorer.tile),

@@ -18,6 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchrefract._io import file_digest
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.coco import Annotation, decompressed, problem_of
 from torchrefract.data.frames import list_files
@@ -186,8 +187,7 @@ class CocoLabels(NamedTuple):
 
     def digest(self) -> str:
         """Return the SHA-256 digest of the file."""
-        with self.path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_digest(self.path)
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if an image is none of the pictures."""
@@ -257,9 +257,7 @@ def digest_of(root: Path, paths: Iterable[Path]) -> str:
     """Return a SHA-256 digest of the names, relative to a root, and the contents of files."""
     digest = hashlib.sha256()
     for path in sorted(paths):
-        with path.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
-        digest.update(ascii((path.relative_to(root).as_posix(), content)).encode())
+        digest.update(ascii((path.relative_to(root).as_posix(), file_digest(path))).encode())
     return digest.hexdigest()
 
 

@@ -113,7 +113,7 @@ def _has_valid_values(config: Mapping[str, Any]) -> bool:
 
 def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     """Describe how settings differ; empty if they are equal."""
-    before, after = dict(_flatten(first)), dict(_flatten(second))
+    before, after = dict(flatten(first)), dict(flatten(second))
     different = [name for name in before | after if before.get(name) != after.get(name)]
     shown = [
         f"{name} is {before.get(name)} {of_first} and {after.get(name)} {of_second}" for name in different[:_SHOWN]
@@ -121,9 +121,10 @@ def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     return ", ".join(shown) + (f", and {len(different) - _SHOWN} more" if len(different) > _SHOWN else "")
 
 
-def _flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names, joined by dots, and the values of nested mappings."""
     if isinstance(value, Mapping):
         for name, part in value.items():
-            yield from _flatten(part, f"{prefix}.{name}" if prefix else str(name))
+            yield from flatten(part, f"{prefix}.{name}" if prefix else str(name))
     else:
         yield prefix, value

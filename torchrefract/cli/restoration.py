@@ -36,6 +36,7 @@ from torchrefract.cli.options import (
     read_option,
     read_optional,
 )
+from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
@@ -54,7 +55,6 @@ from torchrefract.data.media import (
     is_video,
     output_name,
     video_info,
-    write_map,
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
@@ -403,8 +403,7 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, Unrea
                 with replace_file(target, alone=True) as path:
                     write_picture(image, path, source=file)
                 if job.deviation and deviation is not None:
-                    with replace_file(job.map_target(file), alone=True) as path:
-                        write_map(deviation, path)
+                    write_map(job.map_target(file), deviation)
                 count += 1
             except UnreadableImageError as error:  # the file vanished after it was read
                 _skip(file, error, failed)

@@ -72,7 +72,8 @@ def write_weights(checkpoint: Mapping[str, Any], out: Path) -> None:
     total, count = checkpoint["flows"]
     constant = (total / count.clamp(min=1))[None].float()
     reduced = _resize(constant, [-(-side // _REDUCTION) for side in total.shape[1:]])
-    values = {name: _in_half(value) for name, value in (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()}
+    weights = (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()
+    values = {name: (value.half() if value.is_floating_point() else value).contiguous() for name, value in weights}
     config = {part: checkpoint["config"][part] for part in _CONFIG if part in checkpoint["config"]}
     about = {part: checkpoint[part] for part in _PARTS} | {"config": config, "crc32": _checksum(values)}
     write_file(out, save(values, metadata={_METADATA: json.dumps(about)}))
@@ -101,10 +102,6 @@ def _checksum(values: Mapping[str, Tensor]) -> int:
     for name in sorted(values):
         total = zlib.crc32(values[name].numpy().tobytes(), total)
     return total
-
-
-def _in_half(value: Tensor) -> Tensor:
-    return (value.half() if value.is_floating_point() else value).contiguous()
 
 
 def _resize(flow: Tensor, size: Sequence[int]) -> Tensor:

@@ -225,8 +225,9 @@ class LensDistortion(WarpEffect):
         else:
             applied, values = self.draw_in_ranges(stream, self._source.draw_ranges, image)
             values = self._source.select(values)
-        fx, aspect = values[:, 12], values[:, 13]
-        params = LensParams(applied, values[:, :12], torch.stack([fx, fx * aspect], dim=1), values[:, 14:])
+        coefficients, pinhole, center = values.split((len(POLYNOMIAL12), 2, 2), dim=1)
+        fx, aspect = pinhole.unbind(1)
+        params = LensParams(applied, coefficients, torch.stack([fx, fx * aspect], dim=1), center)
         zoom, shift = self._view(params, *image.shape[2:])
         return params._replace(zoom=zoom, shift=shift)
 
@@ -311,7 +312,12 @@ class LensDistortion(WarpEffect):
         _, focal, center = lens_in_px(params, height, width)
         if params.zoom is not None and params.shift is not None:
             focal, center = focal * params.zoom[:, None], center + width * params.shift
-        size: Any = {"width": width, "height": height, "coefficients": (0.0,) * 12, "model": "polynomial12"}
+        size: Any = {
+            "width": width,
+            "height": height,
+            "coefficients": (0.0,) * len(POLYNOMIAL12),
+            "model": "polynomial12",
+        }
         return [
             Camera(fx=fx, fy=fy, cx=cx, cy=cy, **size)
             for (fx, fy), (cx, cy) in zip(focal.tolist(), center.tolist(), strict=True)
@@ -360,7 +366,7 @@ class LensDistortion(WarpEffect):
 
 
 def check_lens(
-    params: Any, batch: int, *, count: int = 12, model: str = _MODEL, bound: float = _LARGEST_COEFFICIENT
+    params: Any, batch: int, *, count: int = len(POLYNOMIAL12), model: str = _MODEL, bound: float = _LARGEST_COEFFICIENT
 ) -> None:
     """Raise ValueError unless `coefficients`, `focal` and `center` of the parameters are valid lenses.
 

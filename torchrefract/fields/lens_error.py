@@ -25,6 +25,7 @@ from torchrefract.cameras.brown_conrady import (
     newton_undistort,
     used_terms,
 )
+from torchrefract.cameras.radial import RADIAL
 from torchrefract.fields.filled_frame import MARGIN_PX, STILL_PX
 from torchrefract.types import FlowBounds, Range, Simplification
 
@@ -45,9 +46,21 @@ _MIN_GROWTH = 0.05  # a map that grows by less, relative to no lens at all, is n
 # Shares of the budget for dropped terms and for Newton's method; the rest is for the lattice.
 _DROPPED_SHARE, _NEWTON_SHARE = 0.2, 0.1
 # For each coefficient: the power of the radius, and how far it moves a point of the unit circle at most.
-_DEGREES = (*((2 * i + 1, 1.0) for i in range(1, 7)), (2, 3.0), (2, 3.0), (2, 1.0), (4, 1.0), (2, 1.0), (4, 1.0))
+_DEGREES = (
+    *((2 * i + 1, 1.0) for i in range(1, len(RADIAL) + 1)),
+    (2, 3.0),
+    (2, 3.0),
+    (2, 1.0),
+    (4, 1.0),
+    (2, 1.0),
+    (4, 1.0),
+)
 # Terms that are dropped together or not at all, the least important first.
-_GROUPS = (range(8, 12), range(6, 8), (5,), (4,), (3,), (2,), (1,), (0,))
+_GROUPS = (
+    range(len(RADIAL) + 2, len(POLYNOMIAL12)),
+    range(len(RADIAL), len(RADIAL) + 2),
+    *((i,) for i in reversed(range(len(RADIAL)))),
+)
 
 
 class LensRanges(NamedTuple):
@@ -62,7 +75,7 @@ class LensRanges(NamedTuple):
     @classmethod
     def from_numbers(cls, numbers: Sequence[Range]) -> "LensRanges":
         """Build from the ranges of all 16 numbers."""
-        return cls(tuple(numbers[:12]), *numbers[12:])
+        return cls(tuple(numbers[:-4]), *numbers[-4:])
 
     @property
     def numbers(self) -> tuple[Range, ...]:
@@ -109,9 +122,9 @@ class LensErrorModel:
         if measured is None:
             return None
         spans = np.array([box.coefficients for box in self.boxes])  # (boxes, 12, 2)
-        used = [i in np.flatnonzero(spans.any(axis=(0, 2))) for i in range(12)]
+        used = [i in np.flatnonzero(spans.any(axis=(0, 2))) for i in range(len(POLYNOMIAL12))]
         dropped = _droppable(used, measured.moved_px, _DROPPED_SHARE * budget_px)
-        kept = [i for i in range(12) if used[i] and i not in dropped]
+        kept = [i for i in range(len(POLYNOMIAL12)) if used[i] and i not in dropped]
         # A level needs the steps of those before it, whose nodes lie within its own.
         enough = np.maximum.accumulate(measured.newton_px, axis=1) <= _NEWTON_SHARE * budget_px  # (steps, levels)
         if not enough[-1].all():
@@ -302,8 +315,8 @@ def _sample_lenses(boxes: Sequence[LensRanges], height: int, width: int) -> tupl
     """Return coefficients (N, 12, 1), and in px focal lengths and centers (N, 2, 1), of lenses in the boxes."""
     values = torch.from_numpy(np.concatenate([_corners_and_draws(box) for box in boxes]))[:, :, None]
     middle = torch.tensor([[width - 1], [height - 1]], dtype=torch.float64, device="cpu") / 2
-    focal = width * torch.cat([values[:, 12:13], values[:, 12:13] * values[:, 13:14]], dim=1)
-    return values[:, :12], focal, middle + width * values[:, 14:]
+    coefficients, fx, aspect, center = values.split((len(POLYNOMIAL12), 1, 1, 2), dim=1)
+    return coefficients, width * torch.cat([fx, fx * aspect], dim=1), middle + width * center
 
 
 def _corners_and_draws(ranges: LensRanges) -> np.ndarray:
@@ -356,5 +369,6 @@ def _droppable(used: Sequence[bool], moved_px: Sequence[float], budget_px: float
 
 
 def _terms_with(kept: Sequence[int]) -> Terms:
-    radial = [i + 1 for i in kept if i < 6]
-    return Terms(max([0, *radial]), not {6, 7}.isdisjoint(kept), not {8, 9, 10, 11}.isdisjoint(kept))
+    n = len(RADIAL)
+    order = max([0, *(i + 1 for i in kept if i < n)])
+    return Terms(order, any(n <= i < n + 2 for i in kept), any(i >= n + 2 for i in kept))

@@ -168,14 +168,14 @@ def _jacobian(camera: Camera, *, is_fixed: np.ndarray) -> np.ndarray:
 
     Those of coefficients are central differences of the nearest polynomial; columns of a mask (4 + n,) are zero.
     """
-    jacobian = np.zeros((16, len(is_fixed)))
-    jacobian[12, 0], jacobian[14, 2], jacobian[15, 3] = (1 / camera.width,) * 3
-    jacobian[13, :2] = -camera.fy / camera.fx**2, 1 / camera.fx
+    jacobian = np.zeros((len(_NAMES), len(is_fixed)))
+    jacobian[-4, 0], jacobian[-2, 2], jacobian[-1, 3] = (1 / camera.width,) * 3
+    jacobian[-3, :2] = -camera.fy / camera.fx**2, 1 / camera.fx
     for i in np.flatnonzero(~is_fixed[4:]):
         ahead, before = (
             replace(camera, coefficients=tuple(c + step * (k == i) for k, c in enumerate(camera.coefficients)))
             for step in (_STEP, -_STEP)
         )
         ahead, before = (np.array(convert(one, to="polynomial12").camera.coefficients) for one in (ahead, before))
-        jacobian[:12, 4 + i] = (ahead - before) / (2 * _STEP)
+        jacobian[:-4, 4 + i] = (ahead - before) / (2 * _STEP)
     return jacobian

@@ -18,6 +18,7 @@ from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
 from torchrefract.cli.command import print_warning, progress
 from torchrefract.cli.options import find_device, naming, read_option
 from torchrefract.data import media
+from torchrefract.data.frames import evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
 from torchrefract.warping.flow import resize_image
 
@@ -87,8 +88,7 @@ def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, l
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
     # A video that states no frames is read too, which says why it has none.
     counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
-    total, chosen = sum(counts), list[tuple[Path, list[int]]]()
-    numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
+    numbers, chosen = evenly_spaced(sum(counts), max_frames), list[tuple[Path, list[int]]]()
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
         chosen.append((file, [number - start for number in numbers if start <= number < end]))
     return chosen

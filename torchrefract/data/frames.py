@@ -163,6 +163,12 @@ def split_frames(
     return sorted(frame for frame in frames if split in (None, "all", frame.split))
 
 
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Return at most `count` of the numbers below `total`, evenly spaced."""
+    count = min(count, total)
+    return [i * total // count for i in range(count)]
+
+
 def name_prefix(stem: str) -> str:
     """Return the drive of a file name without extension: the name up to the number of the frame.
 

@@ -33,8 +33,17 @@ from torchrefract.cli.options import (
     read_optional,
     read_place,
 )
-from torchrefract.cli.robustness_scenes import describe_scenes, make_scenes
-from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_scores, read_base, stored_scores
+from torchrefract.cli.robustness_runs import (
+    FORMAT,
+    REFERENCE_WIDTH,
+    SCORES,
+    describe_scenes,
+    levels_of,
+    make_scenes,
+    parse_scores,
+    read_base,
+    stored_scores,
+)
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_frame_of_camera, read_image
@@ -64,7 +73,6 @@ from torchrefract.robustness.scores import (
 )
 
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
-_WIDTH = 1920  # px, of frames for which scenes are described; their quantities do not depend on it
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 _SETTINGS += ("camera", "horizon")
@@ -130,9 +138,11 @@ def test_robustness(cfg: DictConfig) -> None:
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: make_scenes(levels, width, folder.place))
-    quantities = {name: of for name, by in scenes(_WIDTH).items() if (of := quantity_of(by.values()))}
+    quantities = {name: of for name, by in scenes(REFERENCE_WIDTH).items() if (of := quantity_of(by.values()))}
     if folder.depths is None:
-        warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(_WIDTH).values() for effect in by.values()))
+        warn_of_assumed_depth(
+            nn.ModuleList(effect for by in scenes(REFERENCE_WIDTH).values() for effect in by.values())
+        )
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():

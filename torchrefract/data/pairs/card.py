@@ -1,4 +1,4 @@
-"""What describes a complete pair set: a README.md with content, file formats and license, and a table of its pairs."""
+"""The description of a complete pair set: a README.md with content, formats and license, and a table of its pairs."""
 
 import io
 import math

@@ -24,7 +24,7 @@ from torch.func import hessian, jacfwd, jvp, vjp
 import torchrefract as tr
 from torchrefract.cameras import undistort
 from torchrefract.effects.base import Effect
-from torchrefract.labels.polygons import warp_polygons
+from torchrefract.labels.boxes import warp_polygons
 
 Function = Callable[[Tensor], Tensor]
 Case = Callable[[], tuple[Function, Tensor]]

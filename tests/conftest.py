@@ -265,6 +265,17 @@ def drive() -> Callable[..., list[Tensor]]:
     return draw
 
 
+@pytest.fixture
+def blank_figures(monkeypatch) -> None:
+    """Save empty files in place of figures, whose drawing takes longer than all else that some commands do."""
+
+    def save(_: Any, target: Any, **__: Any) -> None:
+        if isinstance(target, str | os.PathLike):
+            Path(target).touch()
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+
+
 class Outcome(NamedTuple):
     """The exit code and the output of a command."""
 

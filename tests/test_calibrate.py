@@ -35,7 +35,7 @@ def rendered_small() -> list[tuple[str, np.ndarray]]:
 
 
 @pytest.fixture
-def pictures(tmp_path, rendered_small) -> Path:
+def pictures(tmp_path, rendered_small, blank_figures) -> Path:
     """Write six pictures of a board below the folder in which commands run."""
     (tmp_path / "pictures").mkdir()
     for name, gray in rendered_small:
@@ -57,15 +57,16 @@ def test_rendered_pictures_on_a_full_disk_raise(tmp_path, monkeypatch):
 
 
 def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibration, "render_views", partial(render_views, count=6))
+    exact = CAMERA.resized(width=640, height=400)
+    monkeypatch.setattr(calibration, "render_views", partial(render_views, camera=exact, count=6))
     outcome = call("calibrate")
     assert outcome.err == ""
     assert outcome.out.startswith("calibration/camera.yaml: opencv5 from 6 views in 6 pictures, error 0.0")
     camera = read_opencv(tmp_path / "calibration" / "camera.yaml")
     for name in ("fx", "fy", "cx", "cy"):
-        assert getattr(camera, name) == pytest.approx(getattr(CAMERA, name), rel=1e-3)
-    assert camera.coefficients == pytest.approx(CAMERA.coefficients, rel=1e-2)
-    assert (camera.width, camera.height, camera.model) == (CAMERA.width, CAMERA.height, "opencv")
+        assert getattr(camera, name) == pytest.approx(getattr(exact, name), rel=1e-3)
+    assert camera.coefficients == pytest.approx(exact.coefficients, rel=1e-2)
+    assert (camera.width, camera.height, camera.model) == (640, 400, "opencv")
     assert "6 views of 6 pictures" in read_report(tmp_path)
     written = {path.name for path in (tmp_path / "calibration").iterdir()}
     assert written == {
@@ -79,6 +80,7 @@ def test_the_camera_of_rendered_pictures_is_recovered(call, tmp_path, monkeypatc
     }
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_camera_of_the_division_model_is_recovered_written_and_rectifies(call, tmp_path):
     exact = replace(SMALL, coefficients=(-0.25,), model="division")
     (tmp_path / "pictures").mkdir()
@@ -108,9 +110,10 @@ def test_views_of_a_still_board_count_once(call, pictures, rendered_small):
     assert f"shows the board where {rendered_small[0][0]} does" in read_report(pictures.parent)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_pictures_that_were_turned_before_they_were_saved_are_warned_of(call, tmp_path):
     (tmp_path / "pictures").mkdir()
-    for k, (name, gray, _) in enumerate(render_views(BOARD, replace(SMALL, cx=360.0, cy=165.0), count=8)):
+    for k, (name, gray, _) in enumerate(render_views(BOARD, replace(SMALL, cx=360.0, cy=165.0), count=6)):
         cv2.imwrite(str(tmp_path / "pictures" / name), np.rot90(gray, 2 * (k % 2)))
     outcome = call("calibrate", *OPTIONS, "drop_share=0")
     assert re.search(r"warning: an error of \d\.\d+ px rms is high: .* turned before they were saved", outcome.err)
@@ -246,10 +249,14 @@ def test_invalid_options_are_one_line_of_error(call, options, message):
     assert re.search(message, call("calibrate", *options).message)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_data, tmp_path):
     board = ("squares=4x5", "square_mm=54", "marker_mm=40.5", "dictionary=DICT_4X4_1000")
     folder = shared_data / "charuco" / "caliscope_cam0"
-    assert call("calibrate", f"images={folder}", *board, "out=out").code == 0
+    (tmp_path / "pictures").mkdir()
+    for path in sorted(folder.glob("*.jpg"))[::2]:
+        (tmp_path / "pictures" / path.name).symlink_to(path)
+    assert call("calibrate", "images=pictures", *board, "out=out").code == 0
     camera = read_opencv(tmp_path / "out" / "camera.yaml")
     numbers = json.loads((folder.parent / "reference.json").read_text())[folder.name]["published"]
     pinhole = {key: numbers[key] for key in ("fx", "fy", "cx", "cy")}
@@ -264,6 +271,7 @@ def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_d
     assert covariance.shape == (4 + len(camera.coefficients),) * 2
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_real_pictures_give_the_camera_of_opencv(call, shared_data, tmp_path):
     folder = shared_data / "charuco" / "opencv_tutorial"
     options = ("squares=5x7", "marker_mm=11", "dictionary=DICT_6X6_250", "lens_model=opencv5", "out=out")

@@ -68,6 +68,9 @@ def test_pictures_keep_their_names_and_are_drawn_by_them(call, folder):
     assert outcome.out.splitlines()[0] == "out: 3 degraded, 0 already existed, 0 skipped"
     assert (outcome.code, outcome.err) == (0, "")
     assert written(folder / "out") == sorted([*NAMES, "config.json"])
+    settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
+    assert settings["scene"] == {"_target_": "torchrefract.presets.cheap_dashcam", "severity": 4}
+    assert (settings["source"], settings["seed"]) == (str(folder / "raw"), 5)
     for name in NAMES:
         expected = degraded(folder, name, presets.cheap_dashcam(4), seed=5).image[0]
         result = np.asarray(cv2.imread(str(folder / "out" / name)))[..., ::-1]
@@ -368,13 +371,6 @@ def test_pictures_that_would_share_labels_or_maps_are_an_error(call, folder):
     assert message.startswith("source must hold pictures whose names differ in more than their extension")
     assert message.endswith("got two of one/b")
     assert call("degrade", *WORDS).code == 0
-
-
-def test_the_settings_are_kept_beside_the_pictures(call, folder):
-    assert call("degrade", *WORDS).code == 0
-    settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
-    assert settings["scene"] == {"_target_": "torchrefract.presets.cheap_dashcam", "severity": 4}
-    assert (settings["source"], settings["seed"]) == (str(folder / "raw"), 0)
 
 
 def test_another_camera_under_the_name_of_the_first_is_not_mixed_with_its_pictures(call, folder):

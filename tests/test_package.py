@@ -3,6 +3,7 @@ import email
 import inspect
 import re
 import runpy
+import sys
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterator
@@ -105,9 +106,8 @@ def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
             missing=sorted(train - calibration),
             calls=[("make_board", "out=board.pdf"), ("calibrate", "images=none", "out=a")],
         ),
-        "restore": WITHOUT.format(
-            missing=["diffusers"], calls=[("restore", "ckpt_path=best.ckpt", "input=.", "out=out")]
-        ),
+        "labels": "import torch; from torchrefract.labels.targets import warp_labels\n"
+        "print(warp_labels({'id': 3}, torch.zeros(2, 4, 5)), 'torchvision' in sys.modules)",
     }
     outcome = spawn("-W", "error", "-c", FORKED.format(scripts=scripts), cwd=folder)
     assert (outcome.code, outcome.err) == (0, "")
@@ -116,6 +116,10 @@ def printed(tmp_path_factory, spawn) -> Callable[[str], tuple[str, str]]:
 
 def test_the_package_imports_torch_and_numpy_only(printed):
     assert printed("package") == ("[]\n", "")
+
+
+def test_plain_targets_do_not_import_torchvision(printed):
+    assert printed("labels") == ("{'id': 3} False\n", "")
 
 
 def test_commands_without_a_model_import_neither_the_training_stack_nor_workers_matplotlib(printed):
@@ -138,9 +142,13 @@ def test_the_calibration_extra_suffices_for_calibration(printed):
     assert err.startswith("error: images must be an existing folder of pictures, got none")
 
 
-def test_restoring_without_diffusers_names_the_extra(printed):
-    message = "error: restore needs diffusers, which is not installed: pip install 'torchrefract[train]'\n"
-    assert printed("restore")[1] == message
+def test_restoring_without_diffusers_names_the_extra(call, monkeypatch):
+    for name in ("diffusers", "diffusers.optimization"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in ("torchrefract.cli.restoration", "torchrefract.restoration.module"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    message = "restore needs diffusers, which is not installed: pip install 'torchrefract[train]'"
+    assert call("restore", "ckpt_path=best.ckpt", "input=.", "out=out").message == message
 
 
 def test_a_command_speaks_before_it_imports_torch(spawn, tmp_path):

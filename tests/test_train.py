@@ -1,6 +1,4 @@
 import csv
-import importlib
-import multiprocessing
 import os
 import re
 import shutil
@@ -17,7 +15,6 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from PIL import Image
-from torch import Tensor
 from torch.utils.data import DataLoader
 
 from torchrefract import presets
@@ -28,6 +25,7 @@ from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkp
 from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.module import Restoration
 
+pytestmark = pytest.mark.usefixtures("blank_figures")  # `trained`, a process of its own, draws them
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
 DDPM = (
     "model=ddpm_image",
@@ -98,18 +96,17 @@ def test_a_run_says_on_what_it_trains_before_it_starts(trained):
     ]
 
 
-def test_a_network_of_lenses_says_so_for_other_warps(call):
-    data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
-    haze = call("train", "+task=undistort", "scene=highveld_heat_haze", *data, "trainer.max_epochs=1").out
+def test_a_network_of_lenses_says_so_for_other_warps(call, small):
+    words = (*(word for word in small if word.startswith("data.")), "+trainer.max_steps=1")
+    haze = call("train", "+task=undistort", "scene=highveld_heat_haze", *words).out
     assert "severity 3; lens_net predicts the flow of a lens alone: add model=resunet for other warps" in haze
 
 
-def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call):
-    data = ("data.train_count=2", "data.val_count=2", "data.batch_size=2", "data.size=[32,64]", "data.workers=0")
-    dust = call("train", "+task=deweather", "scene=unpaved_road", *data, "trainer.max_epochs=1", "run_dir=dust").out
+def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(call, small):
+    words = ("+task=deweather", *small, "+trainer.max_steps=1")
+    dust = call("train", *words, "scene=unpaved_road", "run_dir=dust").out
     assert "severity 3; it moves pixels too, which deweather does not undo: that takes +task=undistort" in dust
-    fog = call("train", "+task=deweather", "scene=cape_town_fog", *data, "trainer.max_epochs=1", "run_dir=fog").out
-    assert "severity 3\n" in fog
+    assert "severity 3\n" in call("train", *words, "scene=cape_town_fog", "run_dir=fog").out
 
 
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
@@ -140,66 +137,40 @@ def test_the_checkpoint_of_a_training_is_sufficient_to_restore(call, tmp_path, t
     assert checkpoint["licenses"] == {"data": None, "pretrained weights": None}
 
 
-def send_in_second_epoch(number: int) -> Callable[..., Tensor]:
-    """Return a training step that sends a signal to its process in the second batch of the second epoch."""
+def test_a_stopped_or_killed_run_continues_to_the_end_of_an_uninterrupted_one(call, trained, monkeypatch):
+    words, run, killed = (*trained.words, "hydra.run.dir=run"), Path("run").resolve(), Path("killed").resolve()
     step = Restoration.training_step
 
-    def training_step(self, batch, index):
+    def stop_in_second_epoch(self, batch, index):
         if (self.current_epoch, index) == (1, 1):
-            os.kill(os.getpid(), number)
+            shutil.copytree(run, killed)  # the files that SIGKILL would leave now
+            os.kill(os.getpid(), signal.SIGTERM)
         return step(self, batch, index)
 
-    return training_step
-
-
-@pytest.fixture
-def killed(monkeypatch, tmp_path, small) -> Path:
-    """Return the folder of a run that received SIGKILL in its second epoch."""
-
-    def run() -> None:
-        sys.argv = ["torchrefract.train", "+task=undistort", *small, "hydra.run.dir=killed"]
-        monkeypatch.setattr(Restoration, "training_step", send_in_second_epoch(signal.SIGKILL))
-        importlib.import_module("torchrefract.train").main()
-
-    # A process that is forked from this one has imported everything.
-    process = multiprocessing.get_context("fork").Process(target=run)
-    process.start()
-    process.join(timeout=300)
-    assert process.exitcode == -signal.SIGKILL
-    return tmp_path / "killed"
-
-
-def test_a_killed_run_resumes_at_its_epoch_and_ends_like_an_uninterrupted_one(call, trained, killed):
+    with monkeypatch.context() as patch:
+        patch.setattr(Restoration, "training_step", stop_in_second_epoch)
+        outcome = call("train", *words)
+    last = run / "last.ckpt"
+    assert (outcome.code, outcome.err) == (143, f"stopped by SIGTERM in step 6; ckpt_path={last} continues\n")
     for name in ("last.ckpt", "best.ckpt"):
         assert read_checkpoint(killed / name, task="undistort")["epoch"] == 0
-    outcome = call("train", *trained.words, f"ckpt_path={killed / 'last.ckpt'}", "hydra.run.dir=run")
-    assert "Traceback" not in outcome.err
-    folder = outcome.folder
+    before = metrics(run, "val/loss")
+    for name in (".last.part.ckpt", ".best-0123abcd.ckpt"):
+        (run / name).touch()
+    assert call("train", *words, f"ckpt_path={last}").code == 0
+    assert metrics(run, "val/loss", file="metrics_before.csv") == before
+    assert sorted(metrics(run, "val/loss")) == [1]
+    assert not list(run.glob(".*"))
+    folder = call("train", *trained.words, f"ckpt_path={killed / 'last.ckpt'}", "hydra.run.dir=again").folder
     assert {*FILES} <= {path.name for path in folder.iterdir()}
     for name in ("train/loss", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         resumed, expected = metrics(folder, name), metrics(trained.folder, name)
         assert metrics(folder, name, file="metrics_before.csv") == pytest.approx({0: expected[0]}, rel=1e-3)
         assert resumed == pytest.approx({1: expected[1]}, rel=1e-3)
-    weights, expected = (read_checkpoint(run / "last.ckpt")["state_dict"] for run in (folder, trained.folder))
-    name = "network.network.segmentation_head.0.weight"
-    assert torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4)
-
-
-def test_a_stopped_run_says_how_to_continue_and_keeps_its_metrics(call, trained, monkeypatch):
-    words, path = (*trained.words, "hydra.run.dir=run"), Path("run", "last.ckpt").resolve()
-    with monkeypatch.context() as patch:
-        patch.setattr(Restoration, "training_step", send_in_second_epoch(signal.SIGTERM))
-        outcome = call("train", *words)
-    assert (outcome.code, outcome.err) == (143, f"stopped by SIGTERM in step 6; ckpt_path={path} continues\n")
-    before = metrics(path.parent, "val/loss")
-    for name in (".last.part.ckpt", ".best-0123abcd.ckpt"):
-        (path.parent / name).touch()
-    assert call("train", *words, f"ckpt_path={path}").code == 0
-    assert metrics(path.parent, "val/loss", file="metrics_before.csv") == before
-    assert sorted(metrics(path.parent, "val/loss")) == [1]
-    assert not list(path.parent.glob(".*"))
-    weights, expected = (read_checkpoint(run / "last.ckpt")["state_dict"] for run in (path.parent, trained.folder))
-    assert all(torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4) for name in weights)
+    expected = read_checkpoint(trained.folder / "last.ckpt")["state_dict"]
+    for path in (run, folder):
+        weights = read_checkpoint(path / "last.ckpt")["state_dict"]
+        assert all(torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4) for name in expected)
 
 
 def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatch):

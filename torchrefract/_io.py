@@ -1,6 +1,7 @@
 """Paths on this machine and in object stores, atomic file writes, and the folder of the configuration files."""
 
 import errno
+import hashlib
 import logging
 import os
 import re
@@ -97,6 +98,12 @@ def read_bytes(path: Path) -> bytes:
     return retried(lambda: store_of(path).cat_file(cast(Any, path).path), path)
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 digest of a file on this machine."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def matching_files(folder: Path, pattern: str) -> list[Path]:
     """Return the files of a folder whose names match a pattern, sorted; stores would take the folder's for one, too."""
     try:
@@ -178,3 +185,12 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: str | bytes, *, alone: bool = False) -> None:
+    """Replace a file by a text in UTF-8, or by bytes; see `replace_file`."""
+    with replace_file(path, alone=alone) as temporary:
+        if isinstance(content, str):
+            temporary.write_text(content, encoding="utf-8")
+        else:
+            temporary.write_bytes(content)

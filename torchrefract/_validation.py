@@ -116,6 +116,13 @@ def check_tensor(name: str, value: Tensor) -> Tensor:
     return value
 
 
+def check_rgb(name: str, image: Tensor) -> Tensor:
+    """Return `image` if it has the shape (B, 3, H, W)."""
+    if image.ndim != 4 or image.shape[1] != 3:
+        raise ValueError(f"{name} must have shape (B, 3, H, W), got {tuple(image.shape)}")
+    return image
+
+
 def check_flow(name: str, flow: Tensor) -> Tensor:
     """Return `flow` if it is a floating tensor (B, 2, H, W)."""
     check_tensor(name, flow)

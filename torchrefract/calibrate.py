@@ -18,9 +18,6 @@ Options:
 Examples:
     python -m torchrefract.calibrate images=pictures squares=11x8 square_mm=22 marker_mm=14 dictionary=DICT_5X5_250
     python -m torchrefract.calibrate images=pictures board=chessboard squares=10x7 square_mm=25 out=front
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

@@ -19,14 +19,11 @@ Options:
 Examples:
     python -m torchrefract.degrade source=drive.mp4 out=fog scene=cape_town_fog
     python -m torchrefract.degrade source=val2017 labels=instances_val2017.json out=lens scene=cheap_dashcam severity=5
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'source=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command
 
-main = command("degrade", __doc__, "degradation:degrade")
+main = command("degrade", __doc__, "degradation:degrade", file="source=my drive (1).mp4")
 
 if __name__ == "__main__":
     main()

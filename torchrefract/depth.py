@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_choice, check_positive
+from torchrefract._validation import check_choice, check_positive, check_rgb
 from torchrefract.effects.batch import per_sample
 from torchrefract.fields.depth import DepthProvider, GroundPlaneDepth, check_depth
 from torchrefract.fields.sky import sky_mask
@@ -91,8 +91,7 @@ class TransformersDepth:
         Raises:
             ValueError: not three channels; an output of the network that is not in m, see `check_depth`.
         """
-        if image.ndim != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        check_rgb("image", image)
         image = image.detach().float()
         depth, is_sky = self._predict(image), sky_mask(image)
         check_depth(depth, name="output of the model")

@@ -18,14 +18,11 @@ Options:
 Examples:
     python -m torchrefract.estimate_depth source=frames out=depth road.camera_height=1.2
     python -m torchrefract.estimate_depth source=drive.mp4 out=depth network=models/depth-anything device=cuda
-
-Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
-needs quotes, as in `'source=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command
 
-main = command("estimate_depth", __doc__, "depth:estimate_depth")
+main = command("estimate_depth", __doc__, "depth:estimate_depth", file="source=my drive (1).mp4", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

@@ -15,14 +15,11 @@ Options:
 Examples:
     python -m torchrefract.estimate_lens input=drive.mp4 out=camera.yaml
     python -m torchrefract.estimate_lens input=frames out=camera.yaml checkpoint=best.ckpt fov_deg=120
-
-Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
-needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command
 
-main = command("estimate_lens", __doc__, "lens:estimate_lens")
+main = command("estimate_lens", __doc__, "lens:estimate_lens", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

@@ -18,9 +18,6 @@ Options:
 Examples:
     python -m torchrefract.eval ckpt_path=runs/undistort/2026-01-01_10-00-00/best.ckpt
     python -m torchrefract.eval ckpt_path=best.ckpt data.root=other_frames trainer=gpu
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

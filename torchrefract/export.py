@@ -11,9 +11,6 @@ Options:
 Examples:
     python -m torchrefract.export ckpt_path=best.ckpt size=720x1280
     python -m torchrefract.export ckpt_path=best.ckpt out=model.pt2 interpolation=bilinear
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

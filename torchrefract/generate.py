@@ -19,9 +19,6 @@ Options:
 Examples:
     python -m torchrefract.generate scene=paper_refractive source=frames out=pairs license="CC BY 4.0"
     python -m torchrefract.generate scene=cape_town_fog source=drive.mp4 out=fog count=16000 tar=1000 license=CC0
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

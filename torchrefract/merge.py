@@ -10,14 +10,11 @@ Options:
 
 Example:
     python -m torchrefract.merge out=pairs verify=true
-
-Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
-needs quotes, as in `'out=my pairs'`.
 """
 
 from torchrefract.cli.entry import command
 
-main = command("merge", __doc__, "merging:merge")
+main = command("merge", __doc__, "generation:merge", file="out=my pairs", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

@@ -19,7 +19,7 @@ stops the page.
 
 from torchrefract.cli.entry import command
 
-main = command("playground", __doc__, "playground:playground")
+main = command("playground", __doc__, "playground:playground", file=None)
 
 if __name__ == "__main__":
     main()

@@ -19,9 +19,6 @@ Options:
 Examples:
     python -m torchrefract.preview image.jpg scene=cape_town_fog scene.severity=5
     python -m torchrefract.preview drive.mp4 scene=highveld_heat_haze out=haze.gif
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

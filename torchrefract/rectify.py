@@ -14,9 +14,6 @@ Options:
 Examples:
     python -m torchrefract.rectify input=drive.mp4 camera=calibration/camera.yaml
     python -m torchrefract.rectify input=pictures camera=camera.yaml out=wide zoom=0.8
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

@@ -21,9 +21,6 @@ Examples:
     python -m torchrefract.restore ckpt_path=ddpm.ckpt input=frames out=clear device=cuda batch=16 +model.steps=50
 
 `+model.steps=50` changes a value of the model, here of a diffusion model.
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

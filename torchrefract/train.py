@@ -20,9 +20,6 @@ Options:
 Examples:
     python -m torchrefract.train +task=undistort data=frames data.root=frames trainer=gpu
     python -m torchrefract.train +experiment=table1_segformer_deweather scale=small data.root=frames
-
-Options of Hydra: `--cfg job` prints all options with their values, `-m` runs each combination of values such as
-`seed=1,2`. A file name may hold any letters; only the shell needs quotes, as in `'input=my drive (1).mp4'`.
 """
 
 from torchrefract.cli.entry import command

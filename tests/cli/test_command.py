@@ -16,8 +16,9 @@ from PIL import Image
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import naming, prepare_arguments, progress, quote_text, run
+from torchrefract.cli.command import prepare_arguments, progress, quote_text, run
 from torchrefract.cli.entry import command
+from torchrefract.cli.options import naming
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint

@@ -97,6 +97,7 @@ def test_cropped_frames_have_a_cropped_camera(call, folder):
     assert "error: camera must be that of all frames, got a.png: image must have the shape" in outcome.err
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(call, folder):
     for drive in ("u", "v"):
         (folder / "drives" / drive).mkdir(parents=True)

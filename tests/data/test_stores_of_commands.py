@@ -172,6 +172,7 @@ def test_frames_in_a_store_are_those_on_disk(memory, frames):
         FrameFolder("memory://none", size=(16, 24))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_training_on_frames_in_a_store_is_that_on_disk(call, memory, frames, small):
     memory.put(str(frames), "/frames", recursive=True)
     options = [word for word in small if not word.startswith(("data.train", "data.val"))]

@@ -97,7 +97,7 @@ ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (tr.Vignetting, {"strength_range": (0.0, 1.5)}, "strength_range must"),
 ]
 TYPES: list[tuple[type, dict[str, Any], str]] = [
-    (tr.HeterogeneousFog, {"depth": 100.0}, "depth must be"),
+    (tr.HeterogeneousFog, {"depth": 100.0}, r"depth must be a provider such as LinearDepth\(\), or a function"),
     (tr.HeterogeneousFog, {"camera": "dashcam"}, "camera must be"),
     (tr.HeterogeneousFog, {"linear_light": 1}, "linear_light must be"),
     (tr.LensFlare, {"clip": 1}, "clip must be True or False, got 1"),

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import LensDistortion, warp_points
-from torchrefract.labels.polygons import polygon_area, warp_polygons
+from torchrefract.labels.boxes import polygon_area, warp_polygons
 
 HEIGHT, WIDTH = 90, 120
 

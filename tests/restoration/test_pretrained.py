@@ -122,6 +122,7 @@ def test_the_shipped_model_reads_the_lens_and_not_a_border(lens_small, make_fram
         assert abs(scores[border] / scores[None] - 1) < 0.2, scores
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_shipped_model_is_scored_by_its_name(call, lens_small):
     size = (96, 168)
     outcome = call("eval", "ckpt_path=lens_small", f"data.size=[{size[0]},{size[1]}]", "data.val_count=4")

@@ -14,6 +14,8 @@ from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.module import Restoration
 from torchrefract.restoration.report import metrics_rows
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 
 @pytest.fixture(params=["memory", "s3", "gs"])
 def store(request, monkeypatch) -> str:

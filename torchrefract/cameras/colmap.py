@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torchrefract._io import write_file
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.documents import Document, abbreviate, fit_coefficients, list_names, read_text, write_text
+from torchrefract.cameras.documents import Document, abbreviate, fit_coefficients, list_names, read_text
 
 # COLMAP's models by their numbers: the model here, None if there is none; the numbers of focal lengths and of
 # coefficients, with cx and cy between them.
@@ -65,7 +66,7 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
         pinhole = (camera.fx, camera.fy, camera.cx + _OFFSET, camera.cy + _OFFSET)
         values = " ".join(map(repr, (*pinhole, *coefficients)))
         lines.append(f"{number} {model} {camera.width} {camera.height} {values}")
-    write_text(path, "\n".join(lines) + "\n")
+    write_file(Path(path), "\n".join(lines) + "\n")
 
 
 def is_colmap(path: Path) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from torchrefract._io import replace_file
 from torchrefract._validation import warn
 from torchrefract.cameras.camera import Camera
 
@@ -210,11 +209,6 @@ def fit_coefficients(camera: Camera, counts: Sequence[int]) -> tuple[float, ...]
         if not any(values[count:]):
             return (*values[:count], *(0.0,) * (count - len(values)))
     raise ValueError(f"camera must have at most {counts[-1]} coefficients for this file, got {values}")
-
-
-def write_text(path: str | Path, text: str) -> None:
-    with replace_file(Path(path)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _plain(name: Any) -> str:

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from torchrefract._io import write_file
 from torchrefract._validation import check_choice, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.colmap import colmap_rows, is_colmap, read_colmap, write_colmap
@@ -27,7 +28,6 @@ from torchrefract.cameras.documents import (
     parse_documents,
     parse_xml,
     read_text,
-    write_text,
     xml_document,
 )
 from torchrefract.cameras.lens_profiles import (
@@ -177,7 +177,7 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
             data = ", ".join(f"{value:.17e}" for value in matrix["data"])
             lines += [f"{name}: !!opencv-matrix", f"   rows: {matrix['rows']}", f"   cols: {matrix['cols']}"]
             lines += ["   dt: d", f"   data: [ {data} ]"]
-    write_text(path, "\n".join(lines) + "\n")
+    write_file(path, "\n".join(lines) + "\n")
 
 
 def read_ros(path: str | Path) -> Camera:
@@ -211,7 +211,7 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         "rectification_matrix": _matrix(3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
         "projection_matrix": _matrix(3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
-    write_text(path, dump_yaml(document))
+    write_file(Path(path), dump_yaml(document))
 
 
 def read_kalibr(path: str | Path) -> dict[str, Camera]:
@@ -241,7 +241,7 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
         }
         for name, camera in cameras.items()
     }
-    write_text(path, dump_yaml(chains))
+    write_file(Path(path), dump_yaml(chains))
 
 
 class _Form(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
@@ -41,7 +41,8 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
-from torchrefract.cli.command import check_none_lost, make, naming, progress
+from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.options import make, naming, read_option
 from torchrefract.data import media
 from torchrefract.data.images import (
     EXTENSIONS,
@@ -70,10 +71,8 @@ _BOARD_FORMATS = (".pdf", ".png")
 def make_board(cfg: DictConfig) -> None:
     """Write a board as PDF or PNG."""
     board, out = make(cfg, "board"), Path(str(cfg.out))
-    with naming("dpi"):
-        dpi = check_number("dpi", cfg.dpi, low=20.0, high=2400.0)
-    with naming("margin_mm"):
-        margin = check_number("margin_mm", cfg.margin_mm, low=0.0, high=1000.0)
+    dpi = read_option(cfg, "dpi", check_number, low=20.0, high=2400.0)
+    margin = read_option(cfg, "margin_mm", check_number, low=0.0, high=1000.0)
     if out.suffix.lower() not in _BOARD_FORMATS:
         raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
     try:
@@ -91,10 +90,8 @@ def calibrate(cfg: DictConfig) -> None:
     Detections are kept in detections.jsonl, so that an interrupted run continues.
     """
     board = make(cfg, "board")
-    with naming("lens_model"):
-        model = check_choice("lens_model", str(cfg.lens_model), (AUTO, *LENS_MODELS))
-    with naming("drop_share"):
-        max_drop_share = check_number("drop_share", cfg.drop_share, low=0.0, high=0.9)
+    model = read_option(cfg, "lens_model", check_choice, choices=(AUTO, *LENS_MODELS))
+    max_drop_share = read_option(cfg, "drop_share", check_number, low=0.0, high=0.9)
     out = Path(str(cfg.out))
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -251,11 +248,9 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
     if not marker.is_file() or marker.read_text(encoding="utf-8") != content:
         folder.mkdir(exist_ok=True)
         for name, picture, _ in progress(render_views(board), "rendering", count=NUM_VIEWS):
-            _, encoded = cv2.imencode(".png", picture)
-            with replace_file(folder / name) as path:
-                path.write_bytes(encoded.tobytes())  # cv2.imwrite would not say that a disk is full
-        with replace_file(marker) as path:
-            path.write_text(content, encoding="utf-8")
+            # cv2.imwrite would not say that a disk is full.
+            write_file(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+        write_file(marker, content)
     return find_pictures(folder)
 
 
@@ -263,13 +258,12 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
     for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
     if calibration.fit.rms > _HIGH_RMS * calibration.fit.camera.width:
-        print(
-            f"warning: an error of {calibration.fit.rms:.2f} px rms is high: the board may be bent, or the pictures of "
-            "several cameras or zooms, cropped, or turned before they were saved; look at the views in the report",
-            file=sys.stderr,
+        print_warning(
+            f"an error of {calibration.fit.rms:.2f} px rms is high: the board may be bent, or the pictures of several "
+            "cameras or zooms, cropped, or turned before they were saved; look at the views in the report"
         )
     for message in camera_warnings(calibration.fit.camera):
-        print(f"warning: {message}", file=sys.stderr)
+        print_warning(message)
     print(
         f"{out / CAMERA_FILE}: {calibration.fit.model} from {len(calibration.views)} views in "
         f"{len(calibration.detections)} pictures, error {calibration.fit.rms:.3f} px rms, of held-out views "
@@ -281,8 +275,7 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
 def rectify(cfg: DictConfig) -> None:
     """Rectify pictures and videos that are not in the output folder yet, and write the camera of the results."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    with naming("zoom"):
-        zoom = check_number("zoom", cfg.zoom, low=0.05, high=20.0)
+    zoom = read_option(cfg, "zoom", check_number, low=0.05, high=20.0)
     with naming("camera"):
         camera = read_camera(str(cfg.camera), name=cfg.camera_name)
         covariance = read_covariance(str(cfg.camera))
@@ -298,13 +291,9 @@ def rectify(cfg: DictConfig) -> None:
         _write_camera(path, content)
     if not exists.all():
         share = 1 - exists.double().mean().item()
-        print(
-            f"warning: the camera's model folds back inside the frame: {share:.1%} of it stays black", file=sys.stderr
-        )
-
-    for message in (media.describe_turned(files), *media.describe_losses(files, upright=False)):
-        if message:
-            print(f"warning: {message}", file=sys.stderr)
+        print_warning(f"the camera's model folds back inside the frame: {share:.1%} of it stays black")
+    for message in filter(None, (media.describe_turned(files), *media.describe_losses(files, upright=False))):
+        print_warning(message)
 
     @lru_cache(maxsize=2)
     def flow(height: int, width: int) -> Tensor:
@@ -353,10 +342,9 @@ def _part_to_keep(
     if covariance is not None:
         deviation, crop = certain_part(camera, covariance, pinhole)
         if deviation > MAX_DEVIATION_PX and not cfg.crop:
-            print(
-                f"warning: the rectified position has a standard deviation of up to {deviation:.1f} px; in the middle "
-                f"{crop.width} x {crop.height} px it is at most {MAX_DEVIATION_PX:g} px: crop=true keeps these only",
-                file=sys.stderr,
+            print_warning(
+                f"the rectified position has a standard deviation of up to {deviation:.1f} px; in the middle "
+                f"{crop.width} x {crop.height} px it is at most {MAX_DEVIATION_PX:g} px: crop=true keeps these only"
             )
         elif cfg.crop and deviation > MAX_DEVIATION_PX:
             return crop, pinhole.cropped(**crop._asdict())

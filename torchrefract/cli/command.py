@@ -2,7 +2,6 @@
 
 import difflib
 import errno
-import hashlib
 import logging
 import os
 import re
@@ -12,16 +11,14 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import HydraException, InstantiationException, MissingConfigException
-from hydra.utils import instantiate
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
@@ -29,19 +26,15 @@ from rich.progress import track
 from torch import nn
 from yaml import YAMLError
 
-from torchrefract._io import CONFIG_DIR, as_path, is_remote
+from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
-from torchrefract.cli.stores import check_addresses, disk_errors
-from torchrefract.data.images import UnreadableImageError
-from torchrefract.data.pairs.files import DamagedPairError
+from torchrefract.cli.options import FILE_ERRORS
 from torchrefract.fields.corridor import CorridorDepth
 
 _T = TypeVar("_T")
 
-_NUM_SEEDS = 2**32  # NumPy's limit
 _MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
-_FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
 _WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 _WRITING_ERRORS += (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG)  # a file has the name of the folder, and the like
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
@@ -58,6 +51,19 @@ _TASK_OPTIONS = ("+task=", "++task=", "+experiment=", "++experiment=")  # an exp
 # Options of Hydra whose value is the next argument.
 _OPTIONS_WITH_VALUE = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--cfg", "-c")
 _OPTIONS_WITH_VALUE += ("--package", "-p", "--info", "-i", "--experimental-rerun")
+_ADDRESS = r"=['\"]?([A-Za-z][\w+.-]*://.*?)['\"]?$"
+_REMOTE = {  # options that may be an address, and what to do if they must not be one
+    re.compile(r"\+*(out|run_dir|hydra\.(?:run|sweep)\.dir)" + _ADDRESS): "write to a folder and copy it",
+    re.compile(r"(input|source|images?|labels|depth|camera|base)" + _ADDRESS): "copy it to a folder",
+}
+_REMOTE_OPTIONS = {
+    "generate": ("source", "out", "depth"),
+    "degrade": ("source", "out", "depth"),
+    "estimate_depth": ("source", "out"),
+    "merge": ("out",),
+    "train": ("run_dir",),
+    "eval": ("run_dir",),
+}
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 # Warnings of libraries about settings that are intended.
 _IGNORED_WARNINGS = (
@@ -94,9 +100,23 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     # Hydra creates the folder of a run before it calls the job.
     existing = _existing_folders([*filter(None, values), *Path("runs").glob("*"), "runs"])
     with _one_line_errors(name), _one_line_warnings():
-        check_addresses(name, sys.argv[1:])
+        _check_addresses(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
+
+
+def _check_addresses(name: str, arguments: list[str]) -> None:
+    """Raise UsageError if an option is an address, of which pathlib would make a path in a folder such as "s3:".
+
+    Those of `_REMOTE_OPTIONS` may be addresses.
+    """
+    allowed = _REMOTE_OPTIONS.get(name, ())
+    for argument in arguments:
+        for pattern, remedy in _REMOTE.items():
+            if (match := pattern.match(argument)) and match[1] not in allowed:
+                raise UsageError(
+                    f"{match[1]} must be a path on this machine, got {match[2]}; {remedy}, or mount the storage"
+                )
 
 
 def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
@@ -182,68 +202,9 @@ def picture_as_option(name: str, arguments: list[str]) -> list[str]:
     return [f"image={_quote(argument)}" if i in pictures else argument for i, argument in enumerate(arguments)]
 
 
-def check_seed(seed: Any) -> int:
-    """Return `seed` if NumPy and PyTorch accept it."""
-    if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
-        raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
-    return seed
-
-
-def file_digests(values: Iterable[Any]) -> dict[str, str] | None:
-    """Return the SHA-256 digests of the files that are among the values of options, by path; None without any."""
-    paths = [value for value in values if isinstance(value, str) and os.path.isfile(value)]
-    digests = dict[str, str]()
-    for path in paths:
-        with open(path, "rb") as stream:
-            digests[path] = hashlib.file_digest(stream, "sha256").hexdigest()
-    return digests or None
-
-
-def find_device(name: str) -> torch.device:
-    """Return a device by its name; "auto" is a GPU if there is one."""
-    try:
-        device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch asserts in builds without CUDA
-        raise UsageError(f"device must be auto, cpu or another device of this machine, got {name}") from error
-    return device
-
-
-def make(cfg: DictConfig, part: str) -> Any:
-    """Instantiate a part of a configuration."""
-    with naming(part):
-        try:
-            return instantiate(cfg[part])
-        except InstantiationException as error:
-            raise error.__cause__ or error from None
-
-
-@contextmanager
-def naming(part: str) -> Iterator[None]:
-    """Turn errors of values inside the block into UsageError, with the name of a part of the configuration.
-
-    Errors of files and missing modules stay as they are, since they name the file, and `command` the extra.
-    """
-    try:
-        yield
-    except (*_FILE_ERRORS, ModuleNotFoundError):
-        raise
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        if isinstance(error, FileNotFoundError) and error.filename:
-            raise UsageError(f"{part} must name what exists, got {error.filename}: {error.strerror}") from error
-        is_named = str(error).startswith(f"{part} must ")
-        raise UsageError(str(error) if is_named else f"{part}: {error}") from error
-
-
-@contextmanager
-def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
-    """Yield the paths or addresses of the options `source` and `out`; errors of a store for `out` become one line."""
-    with naming("source"):
-        source = as_path(str(cfg.source))
-    with naming("out"):
-        out = as_path(str(cfg.out))
-    with disk_errors(out) if is_remote(out) else nullcontext():
-        yield source, out
+def print_warning(message: str) -> None:
+    """Print a warning to the user as one line."""
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def warn_of_assumed_depth(effect: nn.Module) -> None:
@@ -251,10 +212,9 @@ def warn_of_assumed_depth(effect: nn.Module) -> None:
     for part in effect.modules():
         source = getattr(getattr(part, "medium", part), "depth", None)
         if isinstance(source, CorridorDepth):
-            print(
-                f"warning: {type(part).__name__} assumes the depth of a road between walls; depth maps, as "
-                "estimate_depth writes them, are better: depth=...",
-                file=sys.stderr,
+            print_warning(
+                f"{type(part).__name__} assumes the depth of a road between walls; depth maps, as estimate_depth "
+                "writes them, are better: depth=..."
             )
             return
 
@@ -381,7 +341,7 @@ def _user_message(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
-    if isinstance(error, _FILE_ERRORS):
+    if isinstance(error, FILE_ERRORS):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import sys
 import time
 import warnings
@@ -20,26 +19,26 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, make_folder, relative_name, replace_file, sizes_in_store
-from torchrefract._validation import UsageError, check_choice, check_count, check_positive, first_names
-from torchrefract.cli.command import (
-    check_none_lost,
+from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
+from torchrefract._validation import UsageError, check_choice, check_count, first_names
+from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.options import (
+    check_memory,
     check_seed,
+    depth_folder,
     file_digests,
-    make,
+    make_effect,
     naming,
-    progress,
+    place_scene,
+    read_option,
+    read_workers,
     source_and_out,
-    warn_of_assumed_depth,
 )
-from torchrefract.cli.place import place_scene
-from torchrefract.cli.stores import check_memory
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows
 from torchrefract.data.frames import drives_of
-from torchrefract.data.images import is_lost, local_copy, pixels_of, read_image
-from torchrefract.data.label_boxes import category_names, labeled_boxes
+from torchrefract.data.images import is_lost, local_copy, natural_order, pixels_of, read_image
 from torchrefract.data.label_files import (
     Annotation,
     CocoAnnotations,
@@ -47,13 +46,15 @@ from torchrefract.data.label_files import (
     LabelFolder,
     MovedLabels,
     PictureLabels,
+    category_names,
+    labeled_boxes,
     read_labels,
 )
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import FORMATS, encode_maps
 from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import locked
-from torchrefract.data.workers import map_in_processes, num_cores
+from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.random import key_of
@@ -218,20 +219,14 @@ def _shots(cfg: DictConfig, pictures: Sequence[str]) -> dict[str, _Shot] | None:
     with naming("drive_by"):
         drive_of = drives_of([*pictures], check_choice("drive_by", cfg.drive_by, ("auto", "folder", "prefix")))
     clips: dict[str, list[str]] = {}
-    for name in sorted(pictures, key=_by_number):
+    for name in sorted(pictures, key=natural_order):
         clips.setdefault(drive_of[name], []).append(name)
     return {name: _Shot(drive, clip[0], t) for drive, clip in clips.items() for t, name in enumerate(clip)}
 
 
-def _by_number(name: str) -> list[str | int]:
-    """Return the key that sorts 2.png before 10.png."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
-
-
 def _write(path: Path, data: bytes) -> None:
     make_folder(path.parent)
-    with replace_file(path, alone=True) as temporary:
-        temporary.write_bytes(data)
+    write_file(path, data, alone=True)
 
 
 @contextmanager
@@ -256,8 +251,7 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
     pictures = [name for name, file in names.items() if not media.is_video(file)]
     labels = _labels(cfg, pictures)
     job = _job(cfg, out, root, pictures, labels)
-    with naming("workers"):
-        workers = num_cores() if cfg.workers is None else check_count("workers", cfg.workers, low=0)
+    workers = read_workers(cfg)
     check_memory(workers, out=out, source=source, **({"depth": job.depth.root} if job.depth else {}))
     if is_remote(out) and isinstance(labels, CocoLabels):
         raise UsageError(
@@ -320,8 +314,7 @@ def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:
     """Read the labels and check that each is of a picture."""
     if cfg.labels is None:
         return None
-    with naming("mask_fill"):
-        fill = check_count("mask_fill", cfg.mask_fill, low=0)
+    fill = read_option(cfg, "mask_fill", check_count, low=0)
     with naming("labels"):
         path = Path(str(cfg.labels)).expanduser()
         labels = read_flows(path) or read_labels(path, fill=fill)
@@ -333,20 +326,13 @@ def _job(cfg: DictConfig, out: Path, root: Path, pictures: Sequence[str], labels
     if cfg.severity is not None:
         cfg.scene.severity = cfg.severity
     place_scene(cfg)
-    effect = make(cfg, "scene")
-    if not isinstance(effect, Effect):
-        raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
+    effect = make_effect(cfg, "scene")
     with naming("maps"):
         maps = {True: "png", False: None}.get(cfg.maps, cfg.maps)
         maps = maps if maps is None else check_choice("maps", maps, FORMATS)
-    depth = None
-    if cfg.depth is None:
+    if (depth := depth_folder(cfg)) is None:
         warn_of_assumed_depth(effect)
     else:
-        with naming("depth_scale"):
-            scale = check_positive("depth_scale", cfg.depth_scale)
-        with naming("depth"):
-            depth = DepthFolder(as_path(str(cfg.depth)), scale)
         depth.check((name, None) for name in pictures)
     if maps or labels:
         stems = Counter(str(PurePosixPath(name).with_suffix("")) for name in pictures)
@@ -390,7 +376,7 @@ def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | Non
         without = [t.name for t in tasks if not t.labels and (media.is_video(t.file) or isinstance(labels, CocoLabels))]
         messages.append(f"labels do not list {len(without)} of the files: {first_names(without)}" if without else "")
     for message in filter(None, messages):
-        print(f"warning: {message}", file=sys.stderr)
+        print_warning(message)
 
 
 def _read_journal(out: Path) -> Iterator[tuple[str, list[Annotation]]]:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchrefract._io import make_folder, matching_files, relative_name
 from torchrefract._validation import UsageError, check_count
-from torchrefract.cli.command import find_device, make, naming, progress, source_and_out
+from torchrefract.cli.command import progress
+from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.images import UnreadableImageError, read_image
@@ -35,8 +36,7 @@ def estimate_depth(cfg: DictConfig) -> None:
 
 
 def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
-    with naming("batch"):
-        size = check_count("batch", cfg.batch)
+    size = read_option(cfg, "batch", check_count)
     files = media.find_media(source, deep=True, name="source")
     media.check_output_folder(out, source, deep=True, name="source")
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent

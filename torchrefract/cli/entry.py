@@ -3,26 +3,42 @@
 import importlib
 import signal
 import sys
+import textwrap
 from collections.abc import Callable
 
 _HELP = ("--help", "-h")
+_HYDRA = (
+    "Options of Hydra: `--cfg job` prints all options with their values{sweeps}. A file name may hold any letters; "
+    "only the shell needs quotes, as in `'{file}'`."
+)
+_SWEEPS = ", `-m` runs each combination of values such as `seed=1,2`"
 # Their libraries are in the extra "calibration".
 _CAMERA_COMMANDS = ("calibrate", "rectify", "make_board", "estimate_lens")
 _EXTRAS = {"onnx": "export", "ray": "ray"}  # by the first letters of a library; that of all others is "train"
 
 
-def command(name: str, page: str | None, function: str) -> Callable[[], None]:
+def command(
+    name: str,
+    page: str | None,
+    function: str,
+    *,
+    file: str | None = "input=my drive (1).mp4",
+    has_sweeps: bool = True,
+) -> Callable[[], None]:
     """Return the main function of `python -m torchrefract.<name>`.
 
     Args:
         name: of the module, and of its file in conf.
-        page: the help page, which `--help` prints.
+        page: the help page, which `--help` prints with the options of Hydra below.
         function: as "module:name", with the module in torchrefract.cli. It is called with the configuration.
+        file: an option with a file, as an example of its quotes; None for a page that has the options of Hydra.
+        has_sweeps: True for a command that the option `-m` runs for several values.
     """
 
     def main() -> None:
         if any(argument in _HELP for argument in sys.argv[1:]):
-            print((page or "").strip())
+            options = _HYDRA.format(sweeps=_SWEEPS if has_sweeps else "", file=file)
+            print("\n\n".join([(page or "").strip(), *([textwrap.fill(options, 120)] if file else [])]))
             return
         module, _, attribute = function.partition(":")
         try:

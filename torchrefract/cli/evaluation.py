@@ -1,6 +1,6 @@
 """Default options of `eval`: the configuration with which a checkpoint was validated."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from inspect import isfunction
 from pathlib import Path
 from typing import Any, cast
@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrefract._io import CONFIG_DIR
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.module import PairData, fingerprint
+from torchrefract.data.pairs.configuration import flatten
 from torchrefract.effects.base import Effect
 from torchrefract.fields.depth import DepthProvider
 from torchrefract.restoration.checkpoints import read_checkpoint, safe_config
@@ -81,7 +82,7 @@ def use_validation_config(
         if "effect" in cfg.data:
             cfg.data.effect = cfg.scene
         cfg.model.task = cfg.task
-    before, after = (dict(_flatten(values)) for values in (stored, cast(Any, OmegaConf.to_container(cfg))))
+    before, after = map(_compared, (stored, cast(Any, OmegaConf.to_container(cfg))))
     return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
 
 
@@ -118,14 +119,8 @@ def _is_allowed(value: Any) -> bool:
     return is_class or (isfunction(value) and value.__module__ in _MODULES and not value.__name__.startswith("_"))
 
 
-def _flatten(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the name and the value of what changes a score."""
-    parts = ("data", "model") if not prefix else config
-    for key in parts:
-        name, value = f"{prefix}{key}", config[key]
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{name}.")
-        elif key not in _NOT_COMPARED:
-            yield name, value
-    if not prefix:
-        yield "trainer.limit_val_batches", (config.get("trainer") or {}).get("limit_val_batches")
+def _compared(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the values that change a score, by their names."""
+    parts = flatten({part: config[part] for part in ("data", "model")})
+    values = {name: value for name, value in parts if name.rpartition(".")[2] not in _NOT_COMPARED}
+    return values | {"trainer.limit_val_batches": (config.get("trainer") or {}).get("limit_val_batches")}

@@ -1,9 +1,11 @@
-"""The command that writes pairs to disk: its options, its output folder, its progress and its last line."""
+"""The commands `generate`, which writes pairs to disk, and `merge`, which joins the manifests of its shards."""
 
+import json
 import os
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -17,25 +19,34 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from torchrefract._io import as_path, is_remote, make_folder
+from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
 from torchrefract._validation import (
     UsageError,
     check_choice,
     check_count,
     check_flag,
     check_number,
-    check_positive,
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, check_seed, make, naming, warn_of_assumed_depth
-from torchrefract.cli.place import place_scene
-from torchrefract.cli.stores import check_memory, disk_errors
-from torchrefract.data.depth_maps import DepthFolder
+from torchrefract.cli.command import check_none_lost, warn_of_assumed_depth
+from torchrefract.cli.options import (
+    check_memory,
+    check_seed,
+    depth_folder,
+    disk_errors,
+    make_effect,
+    naming,
+    place_scene,
+    read_option,
+    read_optional,
+    read_path,
+    read_workers,
+)
 from torchrefract.data.frames import Source
-from torchrefract.data.images import UnreadableImageError
+from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.card import summarize, write_card
-from torchrefract.data.pairs.configuration import claim, shard_suffix
+from torchrefract.data.pairs.configuration import check_shards, claim, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -56,9 +67,7 @@ from torchrefract.data.pairs.manifest import (
 )
 from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
-from torchrefract.data.pairs.table import PairTable
-from torchrefract.data.workers import map_in_processes, num_cores
-from torchrefract.effects.base import Effect
+from torchrefract.data.workers import map_in_processes
 
 _T = TypeVar("_T")
 
@@ -109,8 +118,7 @@ class Options(NamedTuple):
 
 def generate(cfg: DictConfig) -> None:
     """Write the missing pairs of a shard, and the card when the set is complete."""
-    with naming("out"):
-        out = as_path(str(cfg.out))
+    out = read_path(cfg, "out")
     with disk_errors(out):
         make_folder(out)
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
@@ -169,48 +177,42 @@ def _is_repaired(row: PairRow, options: Options) -> bool:
 
 
 def _parse(cfg: DictConfig, out: Path) -> Options:
-    camera = place_scene(cfg, size=None if cfg.size is None else _checked(cfg, "size", check_size))
-    effect = make(cfg, "scene")
-    if not isinstance(effect, Effect):
-        raise UsageError(f"scene must be an effect of torchrefract, got {effect}")
+    size = read_optional(cfg, "size", check_size)
+    camera = place_scene(cfg, size=size)
+    effect = make_effect(cfg, "scene")
     if check_seed(cfg.seed) >= _SEED_END:
         raise UsageError(f"seed must be below {_SEED_END}, got {cfg.seed}")
     plain: dict[str, Any] = {
         "seed": cfg.seed,
-        "maps": _checked(cfg, "maps", check_choice, choices=FORMATS),
-        "drive_by": _checked(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
-        "size": None if cfg.size is None else _checked(cfg, "size", check_size),
-        "tar": None if cfg.tar is None else _checked(cfg, "tar", check_count),
-        "every": _checked(cfg, "every", check_count),
-        "val_share": _checked(cfg, "val_share", check_number),
+        "maps": read_option(cfg, "maps", check_choice, choices=FORMATS),
+        "drive_by": read_option(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
+        "size": size,
+        "tar": read_optional(cfg, "tar", check_count),
+        "every": read_option(cfg, "every", check_count),
+        "val_share": read_option(cfg, "val_share", check_number),
     }
     engine = cast(dict[str, Any], OmegaConf.to_container(cfg.engine))
     with naming("device"):
         plain["device"] = choose_device(cfg.device, engine)
     if not 0 < plain["val_share"] < 1:
         raise UsageError(f"val_share must be between 0 and 1, got {plain['val_share']}")
-    verify, shard, workers = _checked(cfg, "verify", check_flag), _shard(cfg), _workers(cfg)
+    verify, shard, workers = read_option(cfg, "verify", check_flag), _shard(cfg), read_workers(cfg)
     if engine["name"] == "ray" and workers == 0:
         raise UsageError("workers must be at least 1 for engine=ray, which counts its actors, got 0")
     if engine["name"] == "ray" and engine["address"]:
         check_cluster(str(engine["address"]))
-    with naming("source"):
-        source = as_path(str(cfg.source))
+    source = read_path(cfg, "source")
     check_memory(workers, out=out, source=source)
     if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
         raise UsageError("license must be that of the source, in words, got nothing")
-    count = None if cfg.count is None else _checked(cfg, "count", check_count)
+    count = read_optional(cfg, "count", check_count)
     listed, write_list = _list_frames(cfg, source, out, plain)
     num_pairs = listed.num_frames if count is None else count
     sources = listed.limited(num_pairs)
-    depth = None
-    if cfg.depth is not None:
-        with naming("depth"):
-            folder = as_path(str(cfg.depth))
-        check_memory(workers, depth=folder)
-        depth = DepthFolder(folder, _checked(cfg, "depth_scale", check_positive))
+    if (depth := depth_folder(cfg)) is not None:
+        check_memory(workers, depth=depth.root)
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
@@ -257,11 +259,6 @@ def _list_frames(
     return sources, lambda: sources.write(path, options)
 
 
-def _checked(cfg: DictConfig, name: str, check: Callable[..., _T], **limits: Any) -> _T:
-    with naming(name):
-        return check(name, cfg[name], **limits)
-
-
 def _shard(cfg: DictConfig) -> Shard:
     """Return the shard of the options, by default torchrun's rank."""
     if (cfg.shard is None) != (cfg.shards is None):
@@ -273,12 +270,6 @@ def _shard(cfg: DictConfig) -> Shard:
     if number >= total:
         raise UsageError(f"shard must be below shards = {total}, got {number}")
     return Shard(number, total)
-
-
-def _workers(cfg: DictConfig) -> int:
-    if cfg.workers is not None:
-        return _checked(cfg, "workers", check_count, low=0)
-    return num_cores()
 
 
 def _report(options: Options, complete: set[int], damaged: int) -> None:
@@ -346,24 +337,84 @@ def _with_progress(units: Iterable[list[PairRow]], *, total: int) -> Iterator[li
 def _finish(options: Options, out: Path, *, num_made: int) -> None:
     """Write the card if all shards have finished, and print the last line."""
     rows = scan_rows(find_manifests(out), lambda row: row.number < options.num_pairs, skip_invalid=True)
-    table = PairTable(options.settings)
-    summary = summarize(table.collect(row for row, _ in rows))
+    summary = summarize((row for row, _ in rows), settings=options.settings)
     num_complete, num_skipped = summary.splits.total(), len(summary.skipped)
     missing = options.num_pairs - num_complete - num_skipped
     if num_complete == 0 and not missing:
         raise UsageError(f"source must hold readable frames, got {summary.skipped[0]}")
     if not missing:
-        table.write(out)
         write_card(out, summary, settings=options.settings, license_text=options.license)
     rest = f"{missing} are missing or left to other shards" if missing else "see README.md in this folder"
     skipped = f", {num_skipped} frames are unreadable" if num_skipped else ""
-    list_unreadable(summary.skipped)
+    _list_unreadable(summary.skipped)
     print(f"{out}: {num_made} pairs made, {num_complete} in total{skipped}; {rest}")
 
 
-def list_unreadable(reasons: Sequence[str]) -> None:
+def _list_unreadable(reasons: Sequence[str]) -> None:
     """Print the reasons of frames without a pair."""
     for reason in reasons[:_SHOWN]:
         print(f"unreadable, tried again by the same command: {reason}")
     if len(reasons) > _SHOWN:
         print(f"and {len(reasons) - _SHOWN} more, which the manifest names")
+
+
+def merge(cfg: DictConfig) -> None:
+    """Join the manifests of a set; raise UsageError if it lacks a pair, or has one twice or of other options."""
+    out = read_path(cfg, "out")
+    verify = read_option(cfg, "verify", check_flag)
+    settings, count, license_text = _configuration(out)
+    with disk_errors(out), locked_shard(out, 0, 1):
+        count = check_shards(out, settings, count)
+        num_rows = _count_lines(out)
+        _check_configuration(out, settings, count)
+        manifest = Manifest(out, 0, 1)
+        complete, _ = manifest.open(lambda number: number < count, verify=verify, is_repaired=lambda _: False)
+        draws = Counter((row.seed, row.key) for row, _ in scan_rows([manifest.path], lambda row: not row.skipped))
+        rows = (row for row, _ in scan_rows([manifest.path], lambda _: True))
+        summary = summarize(rows, settings=settings)
+        _list_unreadable(summary.skipped)
+        print(
+            f"{out}: {summary.splits.total()} of {count} pairs, {len(summary.skipped)} frames are unreadable, "
+            f"{num_rows - len(complete)} rows dropped that repeat others or lack their files"
+        )
+        if missing := [str(number) for number in range(count) if number not in complete]:
+            raise UsageError(
+                f"out must hold {count} pairs, got {len(missing)} missing: {first_names(missing)}; the same commands "
+                "of generate make them"
+            )
+        if repeated := [str(key) for (_, key), times in draws.items() if times > 1]:
+            raise UsageError(f"out must hold each draw once, got pairs that share the keys {first_names(repeated)}")
+        write_card(out, summary, settings=settings, license_text=license_text)
+        for path in shard_configs(out):
+            remove_file(path)
+
+
+def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
+    """Return the settings, the number of pairs and the license in config.json."""
+    try:
+        document = json.loads(read_bytes(out / "config.json"))
+        settings = document["settings"]
+        _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
+        return settings, int(document["count"]), str(document["license"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error
+
+
+def _check_configuration(out: Path, settings: Mapping[str, Any], count: int) -> None:
+    """Raise UsageError if rows are of another seed or scene, as of shards that were copied without their options."""
+    rows = (row for row, _ in scan_rows(find_manifests(out), lambda row: row.number < count, skip_invalid=True))
+    expected = settings["scene"]["name"], settings["seed"]
+    # The seed of a draw holds that of the set in its upper bits, see `draw_of`.
+    if other := [str(row.number) for row in rows if (row.scene, row.seed >> 32) != expected]:
+        raise UsageError(
+            f"out must hold pairs of one configuration, got {len(other)} of another seed or scene: "
+            f"{first_names(sorted(other, key=int))}; make each set in a folder of its own"
+        )
+
+
+def _count_lines(out: Path) -> int:
+    count = 0
+    for path in find_manifests(out):
+        with opened(path) as stream:
+            count += sum(1 for _ in stream)
+    return count

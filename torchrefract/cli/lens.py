@@ -15,8 +15,10 @@ from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.command import find_device, naming, progress
+from torchrefract.cli.command import print_warning, progress
+from torchrefract.cli.options import find_device, naming, read_option
 from torchrefract.data import media
+from torchrefract.data.frames import evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
 from torchrefract.warping.flow import resize_image
 
@@ -25,8 +27,7 @@ Predictor = Callable[[Tensor], Tensor]  # from a frame (1, 3, H, W) to the flow 
 
 def estimate_lens(cfg: DictConfig) -> None:
     """Estimate the lens of the camera of pictures and videos, write the camera, and print how certain it is."""
-    with naming("frames"):
-        max_frames = check_count("frames", cfg.frames)
+    max_frames = read_option(cfg, "frames", check_count)
     with naming("fov_deg"):
         focal_of_view(cfg.fov_deg)
     out = Path(str(cfg.out))
@@ -34,7 +35,7 @@ def estimate_lens(cfg: DictConfig) -> None:
         raise UsageError(f"out must end in .xml, .yml or .yaml, got {out}")
     files = media.find_media(Path(str(cfg.input)))
     if turned := media.describe_turned(files):
-        print(f"warning: {turned}", file=sys.stderr)
+        print_warning(turned)
     predict = None if cfg.checkpoint is None else _load_network(cfg)
     estimate_camera(files, out, max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
 
@@ -59,7 +60,7 @@ def estimate_camera(
     with naming("out"):
         write_opencv(out, result.camera, covariance=result.covariance)
     for message in result.warnings:
-        print(f"warning: {message}", file=sys.stderr)
+        print_warning(message)
     k1, k2, *_ = result.camera.coefficients
     deviations = result.covariance.diagonal()[4:6] ** 0.5
     print(
@@ -87,8 +88,7 @@ def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, l
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
     # A video that states no frames is read too, which says why it has none.
     counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
-    total, chosen = sum(counts), list[tuple[Path, list[int]]]()
-    numbers = [i * total // min(max_frames, total) for i in range(min(max_frames, total))]
+    numbers, chosen = evenly_spaced(sum(counts), max_frames), list[tuple[Path, list[int]]]()
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
         chosen.append((file, [number - start for number in numbers if start <= number < end]))
     return chosen

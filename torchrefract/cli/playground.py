@@ -15,7 +15,7 @@ import gradio as gr  # pyright: ignore[reportMissingImports]  # after its settin
 from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._validation import UsageError, check_count
-from torchrefract.cli.command import naming
+from torchrefract.cli.options import read_option
 from torchrefract.cli.playground_view import (
     RENDERED_SIZE,
     Slider,
@@ -57,10 +57,7 @@ _SCRIPT = """() => setInterval(() => document.querySelectorAll(".controls input[
 
 def playground(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C."""
-    with naming("port"):
-        port = check_count("port", cfg.port)
-    with naming("max_side"):
-        max_side = check_count("max_side", cfg.max_side)
+    port, max_side = (read_option(cfg, name, check_count) for name in ("port", "max_side"))
     _check_free(port)
     sliders: Any = OmegaConf.to_container(cfg.sliders)
     page = make_page(sliders, max_side=max_side)

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from hydra.utils import instantiate
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import OmegaConf
 from torch import Tensor
 
@@ -248,6 +247,4 @@ def _draw_one_map(degraded: Degraded, scales: tuple[MapScale, ...]) -> np.ndarra
     draw_legend(layout, scales, x=layout.left(0), y=layout.top(0))
     if is_flow:
         draw_invalid_key(layout, x=layout.left(0), y=layout.top(0) + layout.height + layout.text)
-    canvas = FigureCanvasAgg(layout.figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return layout.render().copy()

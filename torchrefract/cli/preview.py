@@ -1,7 +1,5 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
-import re
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,10 +13,10 @@ from torch import Tensor
 
 from torchrefract._io import replace_file
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
-from torchrefract.cli.command import check_seed, make, naming, progress, warn_of_assumed_depth
-from torchrefract.cli.place import place_scene
+from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
 from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
-from torchrefract.data.images import EXTENSIONS, files_in, fit, read_image
+from torchrefract.data.images import EXTENSIONS, files_in, fit, natural_order, read_image
 from torchrefract.data.media import VIDEOS, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -49,10 +47,9 @@ class _Source(NamedTuple):
 def preview(cfg: DictConfig) -> None:
     """Write a contact sheet of effects on the first frame or, if the format is one of animations, an animation."""
     with naming("size"):
-        place_scene(cfg, size=None if cfg.size is None else check_size("size", cfg.size))
+        place_scene(cfg, size=read_optional(cfg, "size", check_size))
     seed, effects = check_seed(cfg.seed), _effects(cfg)
-    with naming("fps"):
-        fps = check_number("fps", cfg.fps, low=0.1, high=_MAX_FPS)
+    fps = read_option(cfg, "fps", check_number, low=0.1, high=_MAX_FPS)
     source = _source(cfg)
     num_frames = source.frames.num_frames
     if source.depth is None:
@@ -84,24 +81,14 @@ def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, 
 def _effects(cfg: DictConfig) -> dict[str, Effect]:
     """Instantiate the scene or, without one, the effects of the configuration, by name."""
     if cfg.scene is not None:
-        effects = {str(HydraConfig.get().runtime.choices["scene"]): make(cfg, "scene")}
-    elif isinstance(cfg.effects, DictConfig):
-        effects = {name: make(cfg.effects, name) for name in map(str, cfg.effects)}
-    else:
-        effects = {}
-    if not effects:
+        return {str(HydraConfig.get().runtime.choices["scene"]): make_effect(cfg, "scene")}
+    if not (isinstance(cfg.effects, DictConfig) and cfg.effects):
         raise UsageError(f"effects must be at least one effect with its name, got {cfg.effects}")
-    for name, effect in effects.items():
-        if not isinstance(effect, Effect):
-            raise UsageError(f"{name} must be an effect of torchrefract, got {effect}")
-    return effects
+    return {name: make_effect(cfg.effects, name) for name in map(str, cfg.effects)}
 
 
 def _source(cfg: DictConfig) -> _Source:
-    with naming("size"):
-        size = None if cfg.size is None else check_size("size", cfg.size)
-    with naming("frames"):
-        max_frames = check_count("frames", cfg.frames)
+    size, max_frames = read_optional(cfg, "size", check_size), read_option(cfg, "frames", check_count)
     if cfg.image is None:
         if cfg.depth is not None:
             raise UsageError(
@@ -120,7 +107,7 @@ def _source(cfg: DictConfig) -> _Source:
 def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_MapName]]:
     """Return the first frames of a folder or a video, or a picture that repeats, and names of their depth maps."""
     if path.is_dir():
-        files = sorted(files_in(path), key=_natural_order)[:max_frames]
+        files = sorted(files_in(path), key=lambda file: natural_order(file.name))[:max_frames]
         if not files:
             raise UsageError(f"image must be a folder that holds {', '.join(EXTENSIONS)}, got {path}")
         maps = [(file.name, None) for file in files]
@@ -136,11 +123,6 @@ def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_
 
 def _repeat(image: Tensor, num_frames: int) -> FrameSequence:
     return FrameSequence(num_frames, lambda times: ((t, image) for t in times))
-
-
-def _natural_order(path: Path) -> list[str | int]:
-    """Return a sort key by which frame 2 comes before frame 10."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", path.name))]
 
 
 def _read_folder(files: list[Path], times: Iterable[int]) -> Iterator[tuple[int, Tensor]]:
@@ -165,8 +147,7 @@ def _depth(
     cfg: DictConfig, frames: FrameSequence, maps: Sequence[_MapName], size: tuple[int, int] | None
 ) -> tuple[DepthSource, str]:
     """Return the depth of frames that are cropped and reduced to a size, from a map or a folder of maps, and a note."""
-    with naming("depth_scale"):
-        scale = check_positive("depth_scale", cfg.depth_scale)
+    scale = read_option(cfg, "depth_scale", check_positive)
     path, is_animation = Path(str(cfg.depth)), Path(str(cfg.out)).suffix.lower() in animation_formats()
     _, first = next(frames.read([0]))
     height, width = first.shape[2:]
@@ -176,10 +157,9 @@ def _depth(
         last = len(maps) - 1  # a picture that repeats has one map
         return lambda t: folder.read(*maps[min(t, last)], frame_size=(height, width), size=size)[None], ""
     if is_animation and maps[1:]:
-        print(
-            f"warning: {path} is one depth map for all {len(maps)} frames; depth= takes a folder with one for each, as "
-            "estimate_depth writes",
-            file=sys.stderr,
+        print_warning(
+            f"{path} is one depth map for all {len(maps)} frames; depth= takes a folder with one for each, as "
+            "estimate_depth writes"
         )
     depth, missing = read_depth(path, scale=scale)
     with naming("depth"):

@@ -1,6 +1,5 @@
 """The commands `train` and `eval`, and those that apply a model: `restore` writes pictures, `export` a program."""
 
-import hashlib
 import math
 import os
 import signal
@@ -22,13 +21,22 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import as_path, make_folder, matching_files, remove_file, replace_file
+from torchrefract._io import as_path, file_digest, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import check_none_lost, check_seed, find_device, make, naming, progress
+from torchrefract.cli.command import check_none_lost, print_warning, progress
 from torchrefract.cli.evaluation import describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
-from torchrefract.cli.place import place_scene
+from torchrefract.cli.options import (
+    check_seed,
+    find_device,
+    make,
+    naming,
+    place_scene,
+    read_option,
+    read_optional,
+)
+from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
@@ -47,7 +55,6 @@ from torchrefract.data.media import (
     is_video,
     output_name,
     video_info,
-    write_map,
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
@@ -164,7 +171,7 @@ def restore(cfg: DictConfig) -> None:
 def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
     todo = [file for file in files if not job.is_done(file)]
     for loss in describe_losses(todo, upright=True):
-        print(f"warning: {loss}", file=sys.stderr)
+        print_warning(loss)
     start = time.perf_counter()
     failed = dict[Path, UnreadableImageError]()
     num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
@@ -321,12 +328,8 @@ class _Job(NamedTuple):
 
 
 def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
-    with naming("batch"):
-        batch = check_count("batch", cfg.batch)
-    with naming("side_by_side"):
-        side_by_side = check_flag("side_by_side", cfg.side_by_side)
-    with naming("deviation"):
-        deviation = check_flag("deviation", cfg.deviation)
+    batch = read_option(cfg, "batch", check_count)
+    side_by_side, deviation = (read_option(cfg, name, check_flag) for name in ("side_by_side", "deviation"))
     device = find_device(str(cfg.device))
     loaded = load_model(str(cfg.ckpt_path), changes=cfg.model)
     if deviation and (cfg.pool == "lens" or not loaded.model.has_deviation):
@@ -334,8 +337,7 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
             "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at "
             f"least two samples, got true for {loaded.name}"
         )
-    with naming("size"):
-        size = loaded.size if cfg.size is None else check_size("size", cfg.size)
+    size = read_optional(cfg, "size", check_size) or loaded.size
     with naming("tile"):
         sides = (cfg.tile, cfg.tile) if isinstance(cfg.tile, int) else cfg.tile
         tile = None if sides is None else check_size("tile", sides)
@@ -371,10 +373,8 @@ def _check_maps(files: Sequence[Path], job: _Job) -> None:
 
 def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
     """Return everything that decides the output, so that a folder is only continued with the same settings."""
-    with find_checkpoint(str(cfg.ckpt_path)).open("rb") as stream:
-        checkpoint = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
-        "checkpoint": checkpoint,
+        "checkpoint": file_digest(find_checkpoint(str(cfg.ckpt_path))),
         "input": str(job.source.resolve()),
         "size": list(job.restorer.size),
         "tile": job.restorer.tile and list(job.restorer.tile),
@@ -403,8 +403,7 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, Unrea
                 with replace_file(target, alone=True) as path:
                     write_picture(image, path, source=file)
                 if job.deviation and deviation is not None:
-                    with replace_file(job.map_target(file), alone=True) as path:
-                        write_map(deviation, path)
+                    write_map(job.map_target(file), deviation)
                 count += 1
             except UnreadableImageError as error:  # the file vanished after it was read
                 _skip(file, error, failed)

@@ -20,22 +20,41 @@ from torchvision import tv_tensors
 
 import torchrefract
 from torchrefract import random
-from torchrefract._validation import UsageError, check_count, check_flag, check_number, check_positive, first_names
+from torchrefract._validation import UsageError, check_count, check_flag, check_number, first_names
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import check_seed, file_digests, find_device, naming, progress, warn_of_assumed_depth
-from torchrefract.cli.place import read_place
-from torchrefract.cli.robustness_scenes import describe_scenes, make_scenes
-from torchrefract.cli.robustness_scores import FORMAT, SCORES, levels_of, parse_scores, read_base, stored_scores
+from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.options import (
+    check_seed,
+    depth_folder,
+    file_digests,
+    find_device,
+    naming,
+    read_option,
+    read_optional,
+    read_place,
+)
+from torchrefract.cli.robustness_runs import (
+    FORMAT,
+    REFERENCE_WIDTH,
+    SCORES,
+    describe_scenes,
+    levels_of,
+    make_scenes,
+    parse_scores,
+    read_base,
+    stored_scores,
+)
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, check_frame_of_camera, read_image
-from torchrefract.data.label_boxes import boxes_of_coco, boxes_of_yolo
 from torchrefract.data.label_files import (
     CocoLabels,
     LabelFolder,
     MaskFile,
     PictureLabels,
     YoloFile,
+    boxes_of_coco,
+    boxes_of_yolo,
     read_labels,
 )
 from torchrefract.data.pairs.manifest import locked
@@ -54,7 +73,6 @@ from torchrefract.robustness.scores import (
 )
 
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
-_WIDTH = 1920  # px, of frames for which scenes are described; their quantities do not depend on it
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 _SETTINGS += ("camera", "horizon")
@@ -101,11 +119,11 @@ class _Folder(NamedTuple):
 def test_robustness(cfg: DictConfig) -> None:
     """Score the pictures of a folder that have no scores yet, and write tables and a report."""
     out, seed = Path(str(cfg.out)).expanduser(), check_seed(cfg.seed)
-    with naming("loss"):
-        loss = check_number("loss", cfg.loss, low=0.001, high=0.999)
-    with naming("worst"):
-        num_worst = check_count("worst", cfg.worst, low=0)
-    num_draws, batch_size = _worst_case_draws(cfg), _batch_size(cfg)
+    loss = read_option(cfg, "loss", check_number, low=0.001, high=0.999)
+    num_worst = read_option(cfg, "worst", check_count, low=0)
+    num_draws = read_option(cfg, "worst_case_draws", check_count, low=2)
+    num_draws = num_draws if read_option(cfg, "worst_case", check_flag) else None
+    batch_size = read_option(cfg, "batch_size", check_count)
     folder, values = _folder(cfg), cast(dict[str, Any], OmegaConf.to_container(cfg))
     values["camera"] = folder.camera and json.loads(json.dumps(asdict(folder.camera)))  # as it is stored
     settings = {name: values[name] for name in _SETTINGS} | {"labels": folder.labels and folder.labels.digest()}
@@ -120,9 +138,11 @@ def test_robustness(cfg: DictConfig) -> None:
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
     scenes = lru_cache(lambda width: make_scenes(levels, width, folder.place))
-    quantities = {name: of for name, by in scenes(_WIDTH).items() if (of := quantity_of(by.values()))}
+    quantities = {name: of for name, by in scenes(REFERENCE_WIDTH).items() if (of := quantity_of(by.values()))}
     if folder.depths is None:
-        warn_of_assumed_depth(nn.ModuleList(effect for by in scenes(_WIDTH).values() for effect in by.values()))
+        warn_of_assumed_depth(
+            nn.ModuleList(effect for by in scenes(REFERENCE_WIDTH).values() for effect in by.values())
+        )
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
     with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():
@@ -175,19 +195,16 @@ def _print_comparison(comparison: BaseComparison | None, *, has_labels: bool) ->
         f"and {comparison.left_out_of_base} of {comparison.base}"
     )
     if without:
-        print(f"warning: there is no mCE, as the base makes no error in {', '.join(without)}", file=sys.stderr)
+        print_warning(f"there is no mCE, as the base makes no error in {', '.join(without)}")
     if not has_labels:
-        print(
-            "warning: without labels, each error is the disagreement of a model with its own clean predictions",
-            file=sys.stderr,
-        )
+        print_warning("without labels, each error is the disagreement of a model with its own clean predictions")
 
 
 def _print_failures(result: Robustness) -> None:
     if result.failures:
         name, reason = next(iter(result.failures.items()))
         names = first_names(list(result.failures))
-        print(f"warning: the model failed for {names}, which are left out; for {name}: {reason}", file=sys.stderr)
+        print_warning(f"the model failed for {names}, which are left out; for {name}: {reason}")
 
 
 def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
@@ -223,20 +240,6 @@ def choose_score(prediction: Any, target: Any) -> float:
     return classification_score(prediction, target) if is_class else segmentation_score(prediction, target)
 
 
-def _worst_case_draws(cfg: DictConfig) -> int | None:
-    """Return the number of draws of the search for worst cases; None without one."""
-    with naming("worst_case"):
-        is_searched = check_flag("worst_case", cfg.worst_case)
-    with naming("worst_case_draws"):
-        num_draws = check_count("worst_case_draws", cfg.worst_case_draws, low=2)
-    return num_draws if is_searched else None
-
-
-def _batch_size(cfg: DictConfig) -> int:
-    with naming("batch_size"):
-        return check_count("batch_size", cfg.batch_size)
-
-
 def _metric(cfg: DictConfig, path: Path) -> str:
     """Return the name of the score of a picture, by the first of the stored ones."""
     if cfg.score is None:
@@ -262,12 +265,8 @@ def _folder(cfg: DictConfig) -> _Folder:
         missing = [name for name in names if labels.of(name) is None]
         if missing and isinstance(labels, CocoLabels):
             raise UsageError(f"labels must list each picture, got nothing for {first_names(missing)}")
-    with naming("limit"):
-        names = names if cfg.limit is None else names[: check_count("limit", cfg.limit)]
-    depths = None
-    if cfg.depth is not None:
-        with naming("depth_scale"):
-            depths = DepthFolder(Path(str(cfg.depth)).expanduser(), check_positive("depth_scale", cfg.depth_scale))
+    names = names[: read_optional(cfg, "limit", check_count)]
+    if (depths := depth_folder(cfg)) is not None:
         depths.check((name, None) for name in names)
     return _Folder(path, names, labels, depths, [], read_place(cfg), find_device(str(cfg.device)))
 

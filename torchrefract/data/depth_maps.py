@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import is_remote, local_file, relative_name, replace_file, sizes_in_store
+from torchrefract._io import is_remote, local_file, relative_name, sizes_in_store, write_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import fit, image_size, local_copy
 from torchrefract.fields.depth import check_depth
 
-STEP = 1 / 256  # m, of a level of a PNG
+STEP = 1 / 256  # of a level of a PNG: m, or px of a deviation
 _LAST = 65535  # the level of an infinite depth; 0 was not measured
 _SUFFIXES = (".png", ".npy")
 
@@ -94,13 +94,18 @@ class DepthFolder:
 
 def write_depth(path: Path, depth: Tensor) -> None:
     """Write a map (H, W), m, as a PNG of 16 bits in steps of 1/256 m; from 256 m on, it is infinite."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", depth_levels(depth.numpy()))[1].tobytes())
+    write_map(path, depth, lowest=1)
 
 
-def depth_levels(depth: np.ndarray) -> np.ndarray:
-    """Return the levels of a PNG, uint16, for a depth in m."""
-    return np.clip(np.rint(depth.astype(float) / STEP), 1, _LAST).astype(np.uint16)
+def write_map(path: Path, values: Tensor, *, lowest: int = 0) -> None:
+    """Write a map (H, W) as a gray PNG of `map_levels`."""
+    levels = map_levels(values.cpu().numpy(), lowest=lowest)
+    write_file(path, cv2.imencode(".png", levels)[1].tobytes(), alone=True)
+
+
+def map_levels(values: np.ndarray, *, lowest: int = 0) -> np.ndarray:
+    """Return the levels of a PNG, uint16, in steps of 1/256, from the lowest one; 65535 stands for larger values."""
+    return np.clip(np.rint(values.astype(float) / STEP), lowest, _LAST).astype(np.uint16)
 
 
 def depth_of_levels(levels: np.ndarray, scale: float = STEP) -> np.ndarray:

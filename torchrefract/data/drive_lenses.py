@@ -3,15 +3,13 @@
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
 
 from torch import Tensor
 
 from torchrefract.cameras.calibration import estimate_lens
-from torchrefract.data.frames import FrameFolder
+from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
 
-_Item = TypeVar("_Item")
 _MAX_DRIVES, _MAX_FRAMES = 8, 20  # that are looked at
 _MIN_FRAMES = 8  # of a drive; fewer hold too few straight edges
 _SMALLEST_SHIFT = 0.01  # widths
@@ -33,19 +31,13 @@ def bent_drives(frames: FrameFolder) -> dict[str, float]:
     for path, drive in zip(frames.paths, frames.drive_names, strict=True):
         by_drive.setdefault(drive, []).append(path)
     long = [drive for drive, paths in by_drive.items() if len(paths) >= _MIN_FRAMES]
-    shifts = {drive: _edge_shift(_spread(by_drive[drive], _MAX_FRAMES)) for drive in _spread(long, _MAX_DRIVES)}
+    shifts = {long[i]: _edge_shift(by_drive[long[i]]) for i in evenly_spaced(len(long), _MAX_DRIVES)}
     return {drive: shift for drive, shift in shifts.items() if shift > _SMALLEST_SHIFT}
-
-
-def _spread(items: Sequence[_Item], count: int) -> list[_Item]:
-    """Return at most so many items, evenly spaced."""
-    number = min(count, len(items))
-    return [items[i * len(items) // number] for i in range(number)]
 
 
 def _edge_shift(paths: Sequence[Path]) -> float:
     """Return how far the lens of a drive shifts the left and right edge, in widths; 0 if none can be distinguished."""
-    images = _of_one_size(paths)
+    images = _of_one_size([paths[i] for i in evenly_spaced(len(paths), _MAX_FRAMES)])
     if (first := next(images, None)) is None:
         return 0.0
     estimate = estimate_lens(chain([first], images))

@@ -163,6 +163,12 @@ def split_frames(
     return sorted(frame for frame in frames if split in (None, "all", frame.split))
 
 
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Return at most `count` of the numbers below `total`, evenly spaced."""
+    count = min(count, total)
+    return [i * total // count for i in range(count)]
+
+
 def name_prefix(stem: str) -> str:
     """Return the drive of a file name without extension: the name up to the number of the frame.
 
@@ -265,8 +271,7 @@ def _assign_by_folder(root: Path, paths: list[str], folders: dict[str, str]) -> 
     shared = sorted(set(drives["train"].values()) & set(drives["val"].values()) - {_UNNAMED})
     if shared:
         names = first_names(shared)
-        message = f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them"
-        warn(message)
+        warn(f"train and val in {root} both hold frames of {names}, by name; a drive belongs in one of them")
     return [Source(path, drive, split) for split, group in drives.items() for path, drive in group.items()]
 
 
@@ -294,11 +299,10 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
         )
     if 2 * len(frames) > len(drive_of) > _FEW:
         names = first_names(sorted(frames))
-        message = (
+        warn(
             f"{len(drive_of)} frames in {root} seem to come from {len(frames)} drives ({names}): if that is wrong, "
             "train and val share drives; put each drive in a sub-folder of its own"
         )
-        warn(message)
     val, missing = set(), val_share * len(drive_of)
     order = sorted(frames, key=lambda drive: key_of(f"{seed}/{drive}"))
     for drive in order:
@@ -321,8 +325,7 @@ def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[
                 f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
                 f"{examples}; remove them or copy them again"
             )
-        message = f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}"
-        warn(message)
+        warn(f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}")
     sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
     small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
     if small:

@@ -6,6 +6,7 @@ if it is complete: if it has the end marker of JPEG and PNG, or the length that 
 
 import io
 import os
+import re
 import stat
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -96,10 +97,8 @@ def read_file(path: str | Path) -> bytes:
     if not is_remote(path):
         with opened(path) as stream:
             return stream.read()
-    try:
+    with _unreadable(path):
         return read_bytes(cast(Path, path))
-    except OSError as error:
-        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
 
 
 def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tensor:
@@ -168,6 +167,15 @@ def image_header(path: str | Path) -> ImageHeader:
 
 
 @contextmanager
+def _unreadable(path: str | Path) -> Iterator[None]:
+    """Turn errors of the system into UnreadableImageError."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
+
+
+@contextmanager
 def opened(path: str | Path) -> Iterator[BinaryIO]:
     """Open a file for reading; turn errors of the system into UnreadableImageError.
 
@@ -175,31 +183,25 @@ def opened(path: str | Path) -> Iterator[BinaryIO]:
     """
     if is_remote(path):
         store = cast(Path, path)
-        try:
+        with _unreadable(path):
             stream = cast(BinaryIO, retried(lambda: store_of(store).open(cast(Any, store).path, "rb"), store))
-        except OSError as error:
-            raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
         with stream:
             yield stream
         return
-    try:
+    with _unreadable(path):
         mode = os.stat(path).st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             raise UnreadableImageError(f"{path} cannot be opened (a pipe or a device)")
         with open(path, "rb") as stream:
             yield stream
-    except OSError as error:
-        raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
 
 
 @contextmanager
 def local_copy(path: Path) -> Iterator[Path]:
     """Yield a path on this machine with the content of a file, as `local_file` does; errors are those of `opened`."""
     with ExitStack() as stack:
-        try:
+        with _unreadable(path):
             copy = stack.enter_context(local_file(path))
-        except OSError as error:
-            raise UnreadableImageError(f"{path} cannot be opened ({error.strerror})") from error
         yield copy
 
 
@@ -212,6 +214,11 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
         names = [entry.name for entry in entries if not entry.name.startswith(".") and not entry.is_dir()]
     warn_of_unread(folder, names)
     return sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
+
+
+def natural_order(name: str) -> list[str | int]:
+    """Return a sort key by which 2.png comes before 10.png."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def warn_of_unread(source: str | Path, names: Iterable[str]) -> None:

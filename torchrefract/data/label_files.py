@@ -18,14 +18,15 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from torchrefract._io import file_digest
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.coco import Annotation, decompressed, problem_of
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import image_header, opened
-from torchrefract.labels.boxes import warp_boxes
+from torchrefract.labels.boxes import polygon_area, warp_boxes, warp_polygons
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
-from torchrefract.labels.polygons import polygon_area, warp_polygons
+from torchrefract.labels.vehicles import LabeledBoxes
 
 _SUFFIXES = (".txt", ".png")  # of YOLO and masks
 _SIMPLIFICATION_PX = 0.02  # largest distance between a warped outline and the polygon that is written
@@ -186,8 +187,7 @@ class CocoLabels(NamedTuple):
 
     def digest(self) -> str:
         """Return the SHA-256 digest of the file."""
-        with self.path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_digest(self.path)
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if an image is none of the pictures."""
@@ -257,9 +257,7 @@ def digest_of(root: Path, paths: Iterable[Path]) -> str:
     """Return a SHA-256 digest of the names, relative to a root, and the contents of files."""
     digest = hashlib.sha256()
     for path in sorted(paths):
-        with path.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
-        digest.update(ascii((path.relative_to(root).as_posix(), content)).encode())
+        digest.update(ascii((path.relative_to(root).as_posix(), file_digest(path))).encode())
     return digest.hexdigest()
 
 
@@ -393,3 +391,49 @@ def _are_keypoints(numbers: list[float]) -> bool:
     x, y, width, height = numbers[:4]
     keypoints = zip(numbers[4::3], numbers[5::3], numbers[6::3], strict=True)
     return all(v == 0 or (abs(a - x) <= width and abs(b - y) <= height) for a, b, v in keypoints)
+
+
+def boxes_of_yolo(data: bytes, labels: YoloFile, size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
+    """Return the boxes (N, 4), x1, y1, x2, y2, px from the edge of the first pixel, and classes of a YOLO file.
+
+    Args:
+        data: content of the file.
+        labels: name the file in messages.
+        size: (H, W) of the picture.
+
+    Raises:
+        ValueError: an invalid line.
+    """
+    scale = np.array([size[1], size[0]])
+    rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(data, labels.path)]
+    # The center and size of a box, or the corners of a polygon.
+    boxes = [
+        [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
+        for _, at in rows
+    ]
+    return np.reshape(boxes, (-1, 4)), [name for name, _ in rows]
+
+
+def boxes_of_coco(annotations: Sequence[Annotation]) -> np.ndarray:
+    """Return the boxes (N, 4), x1, y1, x2, y2, px from the edge of the first pixel, of annotations with a bbox."""
+    corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4)).astype(float)
+    return np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1)
+
+
+def category_names(labels: CocoLabels) -> dict[int, str]:
+    """Return the names of the categories of a COCO JSON, by id."""
+    categories = [entry for entry in labels.document.get("categories", ()) if isinstance(entry, dict)]
+    return {entry["id"]: str(entry["name"]) for entry in categories if "id" in entry and "name" in entry}
+
+
+def labeled_boxes(labels: PictureLabels | None, size: tuple[int, int], names: Mapping[int, str]) -> LabeledBoxes:
+    """Return the boxes of a picture of `size` (H, W) with their classes: names of COCO, numbers of YOLO."""
+    boxes, classes = np.zeros((0, 4)), list[int | str]()
+    if isinstance(labels, YoloFile):
+        boxes, numbers = boxes_of_yolo(labels.move(None, size).content, labels, size)
+        classes += numbers
+    elif isinstance(labels, CocoAnnotations):
+        annotations = [annotation for annotation in labels.annotations if annotation.get("bbox")]
+        boxes = boxes_of_coco(annotations)
+        classes += [names.get(ids, ids) for ids in (annotation.get("category_id", -1) for annotation in annotations)]
+    return LabeledBoxes(torch.from_numpy(boxes).float() - 0.5, classes)

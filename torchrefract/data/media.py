@@ -26,7 +26,7 @@ from torchrefract.data.images import (
     upright_exif,
     warn_of_unread,
 )
-from torchrefract.data.video import (
+from torchrefract.data.video import (  # noqa: F401 - readers and writers of videos, which this module offers too
     can_write_videos,
     convert_video,
     count_frames,
@@ -37,24 +37,6 @@ from torchrefract.data.video import (
     write_video,
 )
 
-__all__ = [
-    "VIDEOS",
-    "can_write_videos",
-    "check_output_folder",
-    "convert_video",
-    "describe_losses",
-    "describe_turned",
-    "find_media",
-    "is_complete",
-    "is_video",
-    "output_name",
-    "read_video",
-    "video_info",
-    "write_map",
-    "write_picture",
-    "write_video",
-]
-
 # OpenCV prints to the terminal; problems are raised as errors instead.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
@@ -62,7 +44,6 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".m4v", ".webm", ".ts", ".mts"
 
 _ENCODING = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95]}
 _TAGGED = (".jpg", ".jpeg", ".png", ".webp")  # formats that hold EXIF data and color profiles
-_LEVELS, _LAST_LEVEL = 256, 65535  # of a map, in a unit, and the last one that a PNG holds
 _MAX_NAMES = 3  # of files in a message
 
 
@@ -185,12 +166,6 @@ def write_picture(image: Tensor, path: Path, *, source: Path, upright: bool = Tr
     if not is_encoded:
         raise UsageError(f"{path} could not be written as {path.suffix}")
     path.write_bytes(encoded.tobytes())
-
-
-def write_map(value: Tensor, path: Path) -> None:
-    """Write a map (H, W) of at least 0 as a gray PNG of 16 bits, in steps of 1/256; 65535 stands for larger values."""
-    levels = (value.double() * _LEVELS).round().clamp(max=_LAST_LEVEL).cpu().numpy().astype(np.uint16)
-    path.write_bytes(cv2.imencode(".png", levels)[1].tobytes())
 
 
 def _is_turned(file: Path) -> bool:

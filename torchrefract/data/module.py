@@ -16,8 +16,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_co
 from torchrefract._io import is_remote, sizes_in_store
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.stream import PairBatches, check_streamed
+from torchrefract.data.pairs.dataset import PairBatches, PairedFolder, check_streamed
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import ignore_sigterm
 from torchrefract.effects.base import Effect

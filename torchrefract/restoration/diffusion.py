@@ -11,13 +11,12 @@ from pytorch_lightning.callbacks import WeightAveraging
 from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 
-from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_count, check_number
 from torchrefract.random import Stream, noise_key, stream, uniform, white_noise
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.restoration.models.denoiser import conditions
 from torchrefract.restoration.module import RestorationModule
-from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort
+from torchrefract.restoration.tasks import Deweather, Restored, Task, Undistort, frame_sides
 from torchrefract.types import Pair
 from torchrefract.warping.grid import inside
 from torchrefract.warping.warp import warp
@@ -246,18 +245,15 @@ class FlowTarget(Target):
     def encode(self, pair: Pair, size: Sequence[int]) -> Tensor:
         """Encode the flow, clamped to the limit."""
         # Invalid pixels may have any flow, and the network sees them next to valid ones.
-        share = (pair.flow / self._limit_px(pair.flow, size)).nan_to_num(0.0).clamp(-1, 1)
+        share = (pair.flow / (self.limit * frame_sides(pair.flow, size))).nan_to_num(0.0).clamp(-1, 1)
         return torch.log1p(self.mu * share.abs()).copysign(share) / self.mu.log1p()
 
     def decode(self, target: Tensor, degraded: Tensor, size: Sequence[int]) -> Restored:
         """Warp the images along the flow."""
         target = target.clamp(-1, 1)  # from 1 to 2, the inverse of the companding grows by a factor of 100
         share = torch.expm1(self.mu.log1p() * target.abs()).copysign(target) / self.mu
-        flow = share * self._limit_px(target, size)
+        flow = share * self.limit * frame_sides(target, size)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
-
-    def _limit_px(self, like: Tensor, size: Sequence[int]) -> Tensor:
-        return self.limit * as_device_tensor([size[1], size[0]], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)
 
 
 class ImageTarget(Target):

@@ -8,12 +8,11 @@ import torch
 from diffusers import DDPMScheduler
 from torch import Tensor, nn
 
-from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import UsageError, check_count
 from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
 from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
-from torchrefract.restoration.tasks import Restored, Task, Undistort
+from torchrefract.restoration.tasks import Restored, Task, Undistort, frame_sides
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
 
@@ -111,7 +110,7 @@ class FlowDiffusion(AveragedRestoration):
         with full_precision(degraded):
             basis = polynomial_basis(*cell_axes(degraded, 1))
             coefficients = torch.cat([self.center[None], self.components]).unflatten(1, (2, -1))
-            maps = _sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
+            maps = frame_sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
             center, maps = maps[0], maps[1:]
             flow = center + torch.einsum("bk,kchw->bchw", mean, maps)
             restored = Restored(warp(degraded, flow, padding="border")[0], flow)
@@ -188,17 +187,10 @@ class FlowDiffusion(AveragedRestoration):
 
 def fit_polynomial(pair: Pair) -> Tensor:
     """Fit polynomials to the valid flows of pairs, in shares of width and height; return coefficients (B, 2 * 21)."""
-    flow, valid = (
-        value[:, :, ::_STRIDE, ::_STRIDE].flatten(2) for value in (pair.flow / _sides(pair.flow), pair.valid)
-    )
+    shares = pair.flow / frame_sides(pair.flow)
+    flow, valid = (value[:, :, ::_STRIDE, ::_STRIDE].flatten(2) for value in (shares, pair.valid))
     basis = polynomial_basis(*cell_axes(pair.flow, 1))[:, ::_STRIDE, ::_STRIDE].flatten(1).double()
     weighted = basis * valid  # (B, 21, n)
     ridge = _RIDGE * basis.shape[1] * torch.eye(NUM_TERMS, dtype=basis.dtype, device=basis.device)
     sums = weighted @ torch.where(valid, flow, 0.0).mT.double()
     return torch.linalg.solve(weighted @ basis.T + ridge, sums).mT.flatten(1).to(pair.flow)
-
-
-def _sides(flow: Tensor) -> Tensor:
-    """Return width and height, (1, 2, 1, 1)."""
-    sides = [flow.shape[3], flow.shape[2]]
-    return as_device_tensor(sides, dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)

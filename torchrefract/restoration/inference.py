@@ -101,7 +101,7 @@ class LensRestorer:
     def __init__(self, camera: Camera, *, interpolation: str = "bicubic"):
         self.camera = camera
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
-        self._flow = lru_cache(maxsize=2)(self._compute_flow)
+        self._flow = lru_cache(maxsize=2)(lambda h, w: camera_flow(camera.resized(width=w, height=h))[0])
 
     def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
         """Restore pictures (3, H, W) in [0, 1]."""
@@ -114,9 +114,6 @@ class LensRestorer:
         options = {"padding": "border", "interpolation": self.interpolation}
         pairs = zip(images, flows, strict=True)
         return [Restored(warp(image[None], flow, **options)[0].clamp(0, 1), flow) for image, flow in pairs]
-
-    def _compute_flow(self, height: int, width: int) -> Tensor:
-        return camera_flow(self.camera.resized(width=width, height=height))[0]
 
 
 class FullSizeModel(nn.Module):

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._io import as_path, replace_file
+from torchrefract._io import as_path, write_file
 
 if TYPE_CHECKING:
     from torchrefract.restoration.checkpoints import Loaded
@@ -72,11 +72,11 @@ def write_weights(checkpoint: Mapping[str, Any], out: Path) -> None:
     total, count = checkpoint["flows"]
     constant = (total / count.clamp(min=1))[None].float()
     reduced = _resize(constant, [-(-side // _REDUCTION) for side in total.shape[1:]])
-    values = {name: _in_half(value) for name, value in (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()}
+    weights = (checkpoint["state_dict"] | {_CONSTANT: reduced}).items()
+    values = {name: (value.half() if value.is_floating_point() else value).contiguous() for name, value in weights}
     config = {part: checkpoint["config"][part] for part in _CONFIG if part in checkpoint["config"]}
     about = {part: checkpoint[part] for part in _PARTS} | {"config": config, "crc32": _checksum(values)}
-    with replace_file(out) as temporary:
-        temporary.write_bytes(save(values, metadata={_METADATA: json.dumps(about)}))
+    write_file(out, save(values, metadata={_METADATA: json.dumps(about)}))
 
 
 def read_weights(path: Path) -> dict[str, Any]:
@@ -102,10 +102,6 @@ def _checksum(values: Mapping[str, Tensor]) -> int:
     for name in sorted(values):
         total = zlib.crc32(values[name].numpy().tobytes(), total)
     return total
-
-
-def _in_half(value: Tensor) -> Tensor:
-    return (value.half() if value.is_floating_point() else value).contiguous()
 
 
 def _resize(flow: Tensor, size: Sequence[int]) -> Tensor:

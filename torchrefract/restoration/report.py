@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchrefract._io import as_path, is_remote, matching_files, replace_file
 from torchrefract.data.drive_lenses import bent_drives
-from torchrefract.data.frames import FrameFolder
+from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
@@ -386,9 +386,8 @@ def draw_panel(restored: Restored, pair: Pair) -> Figure:
 
 def choose_examples(restored: Restored, pair: Pair) -> tuple[Restored, Pair]:
     """Choose up to 4 examples evenly by degradation, so that a mix of effects shows several kinds; on the CPU."""
-    total, count = len(pair.clean), min(_PANEL_ROWS, len(pair.clean))
     order = psnr(pair.degraded, pair.clean, pair.valid).argsort(stable=True)
-    rows = order[[i * total // count for i in range(count)]]
+    rows = order[evenly_spaced(len(order), _PANEL_ROWS)]
 
     def choose(values: Iterable[Tensor | None]) -> list[Any]:
         return [value if value is None else value[rows].detach().cpu() for value in values]

@@ -1,12 +1,14 @@
 """The two tasks: how a prediction of a network restores an image, and the loss of that restoration."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchrefract._tensor import as_device_tensor
 from torchrefract._validation import check_choice, check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
@@ -75,13 +77,13 @@ class Undistort(Task):
     def restore(self, prediction: Tensor, degraded: Tensor) -> Restored:
         """Warp the degraded image along the predicted flow."""
         smooth = _interpolate_cells(_average_cells(prediction.float(), degraded), degraded)
-        flow = self.limit * torch.tanh(smooth) * _frame_size(smooth)
+        flow = self.limit * torch.tanh(smooth) * frame_sides(smooth)
         return Restored(warp(degraded, flow, padding="border")[0], flow)
 
     def loss_terms(self, restored: Restored, pair: Pair) -> tuple[Tensor, Tensor]:
         """Compute the L1 losses (B,) of image and flow over valid pixels."""
         flow = torch.zeros_like(pair.flow) if restored.flow is None else restored.flow
-        flow_error = (flow - pair.flow).abs() * 2 / _frame_size(pair.flow)
+        flow_error = (flow - pair.flow).abs() * 2 / frame_sides(pair.flow)
         image_error = masked_mean((restored.image - pair.clean).abs(), pair.valid)
         return image_error, masked_mean(flow_error, pair.valid)
 
@@ -157,6 +159,7 @@ def _interpolate_cells(cells: Tensor, degraded: Tensor) -> Tensor:
     return F.interpolate(cells, size=size, mode="bicubic", antialias=True)[:, :, :height, :width]
 
 
-def _frame_size(flow: Tensor) -> Tensor:
-    """Return width and height, (1, 2, 1, 1)."""
-    return torch.tensor([flow.shape[3], flow.shape[2]], dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
+def frame_sides(like: Tensor, size: Sequence[int] | None = None) -> Tensor:
+    """Return width and height, (1, 2, 1, 1), of maps (B, C, H, W) or of the frame (H, W) that they were cut from."""
+    height, width = like.shape[2:] if size is None else size
+    return as_device_tensor([width, height], dtype=like.dtype, device=like.device).view(1, 2, 1, 1)

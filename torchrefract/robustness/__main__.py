@@ -28,14 +28,11 @@ Options:
 Examples:
     python -m torchrefract.robustness model=opencv:hog data=frames out=robustness scene=[cape_town_fog]
     python -m torchrefract.robustness model=my_detector:predict data=frames labels=instances.json out=robustness
-
-Options of Hydra: `--cfg job` prints all options with their values. A file name may hold any letters; only the shell
-needs quotes, as in `'data=my drive (1)'`.
 """
 
 from torchrefract.cli.entry import command
 
-main = command("robustness", __doc__, "robustness:test_robustness")
+main = command("robustness", __doc__, "robustness:test_robustness", file="data=my drive (1)", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

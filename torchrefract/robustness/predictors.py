@@ -3,7 +3,9 @@
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchrefract.robustness.programs import load_program, naming_file
-
 _PROGRAMS = (".pt2", ".onnx", ".pt")
 _HOG_SCALE = 4.0  # a margin that counts as certain
 _LEAST_SCORE = 0.05  # of detections, as in torchvision
 _TASKS = ("ObjectDetection", "SemanticSegmentation", "ImageClassification")  # in names of classes of transformers
 _STORED = (".json", ".safetensors", ".bin")  # files of a model of transformers
 _BOX_TASKS = ("detect", "segment", "pose")  # of Ultralytics
+
+_PARTS = ("boxes", "labels", "scores")  # of a detection
 
 Predict = Callable[[Tensor], Any]
 
@@ -61,7 +63,7 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
     elif kind == "ultralytics":
         predict = _load_ultralytics(os.path.expanduser(name), device)
     elif Path(model).suffix in _PROGRAMS:
-        predict = load_program(Path(model), device)
+        predict = _load_program(Path(model), device)
     elif model == "opencv:hog":
         predict = HogDetector()
     elif name:
@@ -130,7 +132,7 @@ def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
         network = models.get_model(name, weights=None, **parts)
         if not Path(weights).is_file():
             raise ValueError(f"weights must be a file that exists, got {weights}")
-        with naming_file(f"weights must be a state_dict of {name}, got {weights}"):
+        with _naming_file(f"weights must be a state_dict of {name}, got {weights}"):
             network.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     # A segmenter must keep the size of the images, in which the labels are.
     prepare = stored.transforms(resize_size=None) if kind == "segmentation" else stored.transforms()
@@ -147,7 +149,7 @@ def _load_transformers(name: str, device: str) -> Predict:
         "model must be one of the Hugging Face hub that can be reached, or a folder of one (download it elsewhere and "
         f"pass the folder), got {name}"
     )
-    with naming_file(rule):
+    with _naming_file(rule):
         config = transformers.AutoConfig.from_pretrained(name, **options)
     architecture = " ".join(config.architectures or [])
     task = next((task for task in _TASKS if task in architecture), None)
@@ -155,7 +157,7 @@ def _load_transformers(name: str, device: str) -> Predict:
         raise ValueError(
             f"model must be a detector, a semantic segmenter or a classifier, got {name} of {architecture or 'no kind'}"
         )
-    with naming_file(rule):
+    with _naming_file(rule):
         processor = transformers.AutoImageProcessor.from_pretrained(name, **options)
         network = getattr(transformers, f"AutoModelFor{task}").from_pretrained(name, **options)
     network.eval().to(device)
@@ -178,7 +180,7 @@ def _load_ultralytics(name: str, device: str) -> Predict:
     with _installed("ultralytics", "pip install ultralytics", name):
         from ultralytics import YOLO  # noqa: PLC0415 # pyright: ignore[reportMissingImports]  # in no extra
 
-    with naming_file(f"model must be a file of YOLO (.pt) or the name of an architecture (.yaml), got {name}"):
+    with _naming_file(f"model must be a file of YOLO (.pt) or the name of an architecture (.yaml), got {name}"):
         network = YOLO(name)
     if network.task not in _BOX_TASKS:
         raise ValueError(f"model must detect, segment or pose, got {name} of the task {network.task}")
@@ -220,3 +222,102 @@ def import_function(module: str, name: str, device: str = "cpu") -> Callable[...
     if not callable(function):
         raise ValueError(f"a function or an nn.Module must be named, got {module}:{name}, {type(function).__name__}")
     return function
+
+
+def _load_program(path: Path, device: str) -> Predict:
+    """Load a model of TorchScript, torch.export or ONNX, which takes images one after the other.
+
+    Outputs boxes, labels and scores, or those of a scripted detector of torchvision, become dicts. Of others, the first
+    one is the prediction; one of another form than a score of each class, or a class of each pixel, raises ValueError.
+    """
+    if not path.is_file():
+        raise ValueError(f"model must be a file that exists, got {path}")
+    kind = "a TorchScript file of torch.jit.save" if path.suffix == ".pt" else "a program of torch.export or ONNX"
+    with _naming_file(f"model must be {kind}, got {path}"):
+        if path.suffix == ".onnx":
+            outputs = _load_onnx(path)
+        elif not zipfile.is_zipfile(path):  # PyTorch prints pages before it raises for these
+            raise ValueError("it is no ZIP archive")
+        else:
+            outputs = _load_torchscript(path, device) if path.suffix == ".pt" else torch.export.load(path).module()
+
+    def predict(images: Tensor) -> Any:
+        size = (images.shape[2], images.shape[3])
+        predictions = [_prediction(outputs(image), size) for image in images.split(1)]
+        return torch.stack(predictions) if isinstance(predictions[0], Tensor) else predictions
+
+    return predict
+
+
+@contextmanager
+def _naming_file(rule: str) -> Iterator[None]:
+    """Turn any error of a file that a library cannot load into ValueError."""
+    try:
+        yield
+    except ImportError:
+        raise
+    except Exception as error:  # PyTorch and ONNX Runtime raise errors of many types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(f"{rule} ({reason})") from error
+
+
+def _load_torchscript(path: Path, device: str) -> Predict:
+    module = torch.jit.load(path, map_location=device)
+    takes_list = isinstance(module.forward.schema.arguments[1].type, torch.ListType)
+
+    def run(images: Tensor) -> Any:
+        if not takes_list:
+            return module(images)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*always returns a")  # losses and detections
+            return module(list(images))
+
+    return run
+
+
+def _load_onnx(path: Path) -> Predict:
+    from torchrefract.restoration.export import start_session  # noqa: PLC0415 - imports the training stack
+
+    session = start_session(path)
+    given, names = session.get_inputs()[0], [output.name for output in session.get_outputs()]
+
+    def run(images: Tensor) -> dict[str, Tensor]:
+        # Detectors of torchvision are exported for a list of images (3, H, W).
+        image = (images[0] if len(given.shape) == 3 else images).cpu().numpy()
+        return {
+            name: torch.from_numpy(value)
+            for name, value in zip(names, session.run(None, {given.name: image}), strict=True)
+        }
+
+    return run
+
+
+def _prediction(outputs: Any, size: tuple[int, int]) -> Any:
+    named = _named(outputs)
+    if all(isinstance(named.get(name), Tensor) for name in _PARTS):
+        boxes, labels, scores = (named[name] for name in _PARTS)
+        return {"boxes": boxes.reshape(-1, 4), "labels": labels.flatten().long(), "scores": scores.flatten()}
+    first = next(iter(named.values()), None)
+    shape = tuple(first.shape) if isinstance(first, Tensor) else ()
+    if first is not None and shape[:1] == (1,) and (len(shape) == 2 or (len(shape) in (3, 4) and shape[-2:] == size)):
+        return first[0]
+    got = ", ".join(
+        f"{n} {tuple(of.shape) if isinstance(of, Tensor) else type(of).__name__}" for n, of in named.items()
+    )
+    height, width = size
+    raise ValueError(
+        f"model must have the outputs boxes, labels and scores, or a first one (1, K), (1, K, {height}, {width}) or "
+        f"(1, {height}, {width}), got outputs {got}; export it with these names, or pass a function: "
+        "model=package.module:callable"
+    )
+
+
+def _named(outputs: Any) -> Mapping[Any, Any]:
+    """Return the outputs by name or by number; those of a scripted detector are its losses and a list of detections."""
+    if isinstance(outputs, tuple) and len(outputs) == 2 and isinstance(outputs[1], list):
+        outputs = outputs[1]
+    if isinstance(outputs, list | tuple) and len(outputs) == 1 and isinstance(outputs[0], dict):
+        outputs = outputs[0]
+    if isinstance(outputs, dict):
+        return outputs
+    return dict(enumerate(outputs if isinstance(outputs, list | tuple) else [outputs]))

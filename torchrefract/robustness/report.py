@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract._tensor import to_uint8
 from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
@@ -98,8 +98,7 @@ def write_tables(
         "levels": rows,
         "failures": result.failures,
     }
-    with replace_file(out / "results.json") as path:
-        path.write_text(json.dumps(_without_nan(summary), indent=1) + "\n", encoding="utf-8")
+    write_file(out / "results.json", json.dumps(_without_nan(summary), indent=1) + "\n")
 
 
 def write_report(
@@ -162,8 +161,7 @@ def write_report(
         parts += map(_figure, examples)
     page = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
     page += '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    with replace_file(out / "report.html") as path:
-        path.write_text(f"{page}<style>{_STYLE}</style>{''.join(parts)}</html>\n", encoding="utf-8")
+    write_file(out / "report.html", f"{page}<style>{_STYLE}</style>{''.join(parts)}</html>\n")
 
 
 def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, features
 from torch import Tensor
 
@@ -195,9 +194,7 @@ def _draw_background(panels: Sequence[Panel], height: int, width: int) -> tuple[
     if any(scale.name == "flow" for panel in panels for scale in panel.scales):
         draw_invalid_key(layout, x=layout.left(0), y=bottom)
         bottom += 3 * layout.text
-    canvas = FigureCanvasAgg(layout.figure)
-    canvas.draw()
-    drawn = np.asarray(canvas.buffer_rgba())[:bottom, :, :3]
+    drawn = layout.render()[:bottom]
     # Video codecs need even sides.
     return layout, np.pad(drawn, [(0, drawn.shape[0] % 2), (0, drawn.shape[1] % 2), (0, 0)], constant_values=255)
 

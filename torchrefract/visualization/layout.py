@@ -7,8 +7,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import BboxImage
 from matplotlib.transforms import Bbox, TransformedBbox
@@ -107,6 +109,12 @@ class FigureLayout:
         shown = BboxImage(box, interpolation="nearest", origin="upper")
         shown.set_data(to_uint8(image[None])[0].movedim(0, -1).numpy())
         self.figure.add_artist(shown)
+
+    def render(self) -> np.ndarray:
+        """Draw the figure, and return its pixels (height, width, 3), uint8."""
+        canvas = FigureCanvasAgg(self.figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3]
 
     def explain(self, image: Tensor, text: str, *, x: int, y: int) -> None:
         """Write a legend: a patch of an image (3, h, w), three lines wide and two high, and a text to its right."""

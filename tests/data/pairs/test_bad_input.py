@@ -112,23 +112,6 @@ def test_changed_sources_that_are_listed_again_raise(call, words, frames, tmp_pa
     assert re.search(r"frames is 12 there and 11 here, sources is \w+ there", message)
 
 
-def test_an_undecodable_frame_is_skipped_and_reported(call, words, frames, tmp_path, rows):
-    shutil.copytree(frames, tmp_path / "frames")
-    path = tmp_path / "frames" / "drive1" / "005.png"
-    data = bytearray(path.read_bytes())
-    data[200:240] = bytes(40)  # between a good header and a good end
-    path.write_bytes(data)
-    arguments = words("out", source="frames")
-    outcome = call("generate", *arguments)
-    assert "11 in total, 1 frames are unreadable" in outcome.out
-    (row,) = [row for row in rows(tmp_path / "out") if row["skipped"]]
-    assert row["source"] == "drive1/005.png"
-    assert row["skipped"].startswith("drive1/005.png is damaged")
-    assert len(PairedFolder(tmp_path / "out")) == 11
-    assert "drive1/005.png is damaged" in (tmp_path / "out" / "README.md").read_text()
-    assert ": 0 pairs made" in call("generate", *arguments).out
-
-
 def test_a_disk_that_is_too_small_raises_before_a_pair_is_written(call, words, disk):
     folder = disk("size=64k")
     message = call("generate", *words(folder / "out")).message

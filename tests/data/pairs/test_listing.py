@@ -12,6 +12,7 @@ from PIL import Image
 from torchrefract import key_of
 from torchrefract.data.frames import Source
 from torchrefract.data.pairs import sources as listing
+from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.generator import PairGenerator
 from torchrefract.data.pairs.sources import Sources, find_sources, read_sources
 
@@ -72,11 +73,16 @@ def test_an_unreadable_frame_is_tried_again_by_the_same_command(call, words, fra
     shutil.copytree(frames, tmp_path / "frames")
     path = tmp_path / "frames" / "drive1" / "005.png"
     data = path.read_bytes()
-    path.write_bytes(data[:300])
+    path.write_bytes(data[:200] + bytes(40) + data[240:])  # between a good header and a good end
     arguments = words("out", source="frames")
     outcome = call("generate", *arguments)
-    assert "unreadable, tried again by the same command: drive1/005.png is truncated (300 bytes" in outcome.out
+    assert "unreadable, tried again by the same command: drive1/005.png is damaged" in outcome.out
     assert ": 11 pairs made, 11 in total, 1 frames are unreadable" in outcome.out
+    (skipped,) = [row for row in rows(tmp_path / "out") if row["skipped"]]
+    assert skipped["source"] == "drive1/005.png"
+    assert skipped["skipped"].startswith("drive1/005.png is damaged")
+    assert "drive1/005.png is damaged" in (tmp_path / "out" / "README.md").read_text()
+    assert len(PairedFolder(tmp_path / "out")) == 11
     assert ": 0 pairs made, 11 in total, 1 frames are unreadable" in call("generate", *arguments).out
     path.write_bytes(data)
     assert ": 1 pairs made, 12 in total; see" in call("generate", *arguments).out

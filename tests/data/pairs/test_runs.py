@@ -22,13 +22,16 @@ def start(*words: str) -> subprocess.Popen[str]:
 
 
 @pytest.fixture(scope="module")
-def complete(tmp_path_factory, words) -> Path:
-    """A set made by one uninterrupted run."""
-    out = tmp_path_factory.mktemp("complete") / "out"
-    run = start(*words(out, f"count={COUNT}"))
-    _, err = run.communicate(timeout=300)
-    assert run.returncode == 0, err
-    return out
+def shared(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("complete") / "out"
+
+
+@pytest.fixture
+def complete(call, words, shared) -> Path:
+    """Return a set of one uninterrupted run, which the first test makes."""
+    if not shared.exists():
+        assert call("generate", *words(shared, f"count={COUNT}")).code == 0
+    return shared
 
 
 def is_running(process: str) -> bool:

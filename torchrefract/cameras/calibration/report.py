@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.choice import AUTO, FOLDS, Candidate, choose_model
 from torchrefract.cameras.calibration.detection import Detection, View
 from torchrefract.cameras.calibration.fit import Fit, LeaveOneOut, cross_validate, drop_outliers, rms
-from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, rectified_deviation
+from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, rectified_deviation, undistort_pixels
 from torchrefract.cameras.camera import Camera
 
 CAMERA_FILE, REPORT_FILE = "camera.yaml", "report.md"
@@ -117,7 +117,7 @@ def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray
     for name, figure in zip(_FIGURES, figures, strict=True):
         with replace_file(folder / name) as path:
             figure.savefig(path)
-    _write(folder / REPORT_FILE, _report(calibration))
+    write_file(folder / REPORT_FILE, _report(calibration) + "\n")
 
 
 def write_failure(board: Board, detections: Sequence[Detection], problem: str, folder: Path) -> None:
@@ -132,16 +132,11 @@ def write_failure(board: Board, detections: Sequence[Detection], problem: str, f
     if _earlier(folder / CAMERA_FILE).is_file():
         text += f"`{_earlier(folder / CAMERA_FILE).name}` is the camera of an earlier calibration.\n\n"
     rows = [(d.view.name, str(len(d.view.ids)), d.problem) for d in detections]
-    _write(folder / REPORT_FILE, text + _table(("picture", "corners", "problem"), rows))
+    write_file(folder / REPORT_FILE, text + _table(("picture", "corners", "problem"), rows) + "\n")
 
 
 def _earlier(path: Path) -> Path:
     return path.with_name(f"{path.stem}_before{path.suffix}")
-
-
-def _write(path: Path, text: str) -> None:
-    with replace_file(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def _report(calibration: Calibration) -> str:
@@ -216,10 +211,8 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _draw_coverage(calibration: Calibration) -> Figure:
     """Draw all corners, over the number of corners in each cell of the frame."""
     camera, views = calibration.fit.camera, calibration.views
-    figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
-    axes = figure.add_subplot()
+    figure, axes, extent = _frame_axes(camera)
     counts, (rows, columns) = corner_counts(views, (camera.width, camera.height)), CELLS
-    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
     image = axes.imshow(np.where(counts > 0, counts, np.nan), extent=extent, cmap="Blues", alpha=0.6, vmin=0)
     for j, i in zip(*np.nonzero(counts == 0), strict=True):
         place = ((i + 0.5) * camera.width / columns, (j + 0.5) * camera.height / rows)
@@ -257,15 +250,19 @@ def _draw_uncertainty(fit: Fit) -> Figure:
     camera, (rows, columns) = fit.camera, _UNCERTAINTY_GRID
     x, y = np.meshgrid(np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows))
     deviation = rectified_deviation(camera, fit.covariance, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
-    axes = figure.add_subplot()
-    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    figure, axes, extent = _frame_axes(camera)
     image = axes.imshow(deviation, extent=extent, cmap="viridis", vmin=0, interpolation="bilinear")
     if np.nanmax(deviation, initial=0.0) > MAX_DEVIATION_PX:
         axes.contour(x, y, deviation, levels=[MAX_DEVIATION_PX], colors="#ff5030")
     axes.set_title(f"standard deviation of the rectified position, px; the line is at {MAX_DEVIATION_PX:g} px")
     figure.colorbar(image, ax=axes, shrink=0.8)
     return figure
+
+
+def _frame_axes(camera: Camera) -> tuple[Figure, Axes, tuple[float, float, float, float]]:
+    """Return a figure of the frame of a camera, its axes, and the extent of a picture of the frame in them."""
+    figure = Figure(figsize=(9.6, 9.6 * camera.height / camera.width + 0.9), dpi=_DPI, layout="constrained")
+    return figure, figure.add_subplot(), (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
 
 
 def corner_counts(views: Sequence[View], size: tuple[int, int]) -> np.ndarray:
@@ -353,9 +350,5 @@ def straightness(views: Sequence[View], board: Board) -> float:
 
 def undistort_views(views: Sequence[View], camera: Camera) -> list[View]:
     """Undistort the corners of views, as the camera's pinhole shows them; corners without a ray are dropped."""
-    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    undistorted = []
-    for view in views:
-        points, valid, _ = camera.undistort(torch.from_numpy((view.corners - center) / focal))
-        undistorted.append(view._replace(corners=points.numpy() * focal + center).only(valid.numpy()))
-    return undistorted
+    results = [undistort_pixels(camera, view.corners) for view in views]
+    return [view._replace(corners=pixels).only(valid) for view, (pixels, valid) in zip(views, results, strict=True)]

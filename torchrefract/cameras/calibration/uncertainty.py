@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torchrefract.cameras.calibration.fit import camera_values, with_values
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.projection import undistort
 
 MAX_DEVIATION_PX = 2.0  # above which `rectify` warns
 _STEP = 1e-3  # standard deviations
@@ -33,20 +32,21 @@ def rectified_deviation(camera: Camera, covariance: np.ndarray, pixels: np.ndarr
     """
     values, axes = np.linalg.eigh(covariance)
     start, variance = camera_values(camera), np.zeros(len(pixels))
-    is_shown = _rectify(camera, pixels)[1]
+    is_shown = undistort_pixels(camera, pixels)[1]
     for axis in (axes * np.sqrt(values.clip(min=0))).T:
         if not axis.any():
             continue
-        (ahead, _), (before, _) = (_rectify(with_values(camera, start + s * _STEP * axis), pixels) for s in (1, -1))
+        cameras = (with_values(camera, start + sign * _STEP * axis) for sign in (1, -1))
+        (ahead, _), (before, _) = (undistort_pixels(one, pixels) for one in cameras)
         variance += (((ahead - before) / (2 * _STEP)) ** 2).sum(axis=1)
     return np.where(is_shown, np.sqrt(variance), np.nan)
 
 
-def _rectify(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def undistort_pixels(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels (N, 2) as the camera's pinhole shows them, and (N,), bool: it shows them."""
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    coefficients = torch.tensor([camera.coefficients], dtype=torch.float64, device="cpu")
-    result = undistort(torch.from_numpy((pixels - center) / focal)[None], coefficients, model=camera.model)
-    return result.points[0].numpy() * focal + center, result.valid[0].numpy()
+    points, valid, _ = camera.undistort(torch.from_numpy((pixels - center) / focal))
+    return points.numpy() * focal + center, valid.numpy()
 
 
 class Crop(NamedTuple):

@@ -1,6 +1,5 @@
 """Pair sets on disk: generation, files, manifest and datasets."""
 
-from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.stream import PairStream
+from torchrefract.data.pairs.dataset import PairedFolder, PairStream
 
 __all__ = ["PairStream", "PairedFolder"]

@@ -1,4 +1,4 @@
-"""The card of a pair set: a README.md with its content, its file formats and the license of its frames."""
+"""The description of a complete pair set: a README.md with content, formats and license, and a table of its pairs."""
 
 import io
 import math
@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_file
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 from torchrefract.data.pairs.manifest import PairRow
 
-HISTOGRAMS = "parameters.png"
+HISTOGRAMS, TABLE = "parameters.png", "pairs.parquet"
+_BATCH = 10_000  # rows of the table that are Python objects at a time
 
 _NOT_SHOWN = {"effect", "key", "frame", "wind", "drift", "decorrelation"}  # not numbers, or without effect on a frame
 _FORMATS = {
@@ -52,10 +55,12 @@ class Summary(NamedTuple):
     files: tuple[str, ...]  # suffixes of the files of a pair
     num_bytes: int
     parameters: Mapping[tuple[str, str], list["array[float]"]]  # by effect and name, for each component
+    table: "PairTable"
 
 
-def summarize(rows: Iterable[PairRow]) -> Summary:
-    """Count what the rows of a set hold."""
+def summarize(rows: Iterable[PairRow], *, settings: Mapping[str, Any]) -> Summary:
+    """Count what the rows of a set hold, whose settings are those in config.json."""
+    table = PairTable(settings["scene"].get("severity"))
     splits, effects, sizes, beyond = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
     drives, parameters = defaultdict[str, set[str]](set), defaultdict[tuple[str, str], list["array[float]"]](list)
     sources, skipped, files, num_bytes = set[tuple[str, int | None]](), [], (), 0
@@ -63,6 +68,7 @@ def summarize(rows: Iterable[PairRow]) -> Summary:
         if row.skipped:
             skipped.append(row.skipped)
             continue
+        table.add(row)
         split = row.split or "neither"
         splits[split] += 1
         drives[split].add(row.drive)
@@ -78,18 +84,16 @@ def summarize(rows: Iterable[PairRow]) -> Summary:
                 columns.extend(array("d") for _ in range(len(numbers) - len(columns)))
                 for column, number in zip(columns, numbers, strict=False):
                     column.append(number)
-    return Summary(splits, drives, effects, sizes, len(sources), skipped, beyond, files, num_bytes, parameters)
+    return Summary(splits, drives, effects, sizes, len(sources), skipped, beyond, files, num_bytes, parameters, table)
 
 
 def write_card(out: Path, summary: Summary, *, settings: Mapping[str, Any], license_text: str) -> None:
-    """Write the card and its figure into the folder of a set; several shards may do so at the same time."""
-    files, figure = dict[str, bytes](), draw_histograms(summary)
-    if figure is not None:
-        files[HISTOGRAMS] = figure
+    """Write the card, its figure and the table into the folder of a set; several shards may do so at the same time."""
+    summary.table.write(out)
+    if (figure := draw_histograms(summary)) is not None:
+        write_file(out / HISTOGRAMS, figure)
     card = format_card(summary, settings=settings, license_text=license_text, has_histograms=figure is not None)
-    for name, data in (files | {"README.md": card.encode()}).items():
-        with replace_file(out / name) as temporary:
-            temporary.write_bytes(data)
+    write_file(out / "README.md", card.encode())
 
 
 def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: str, has_histograms: bool) -> str:
@@ -169,3 +173,73 @@ def _histogram_panels(summary: Summary) -> Iterable[tuple[str, str, np.ndarray]]
         else:
             for i, column in varied.items():
                 yield effect, f"{name}{f' {_AXES[i]}' if len(arrays) > 1 else ''}{unit}", column
+
+
+class PairTable:
+    """A table of the pairs of a set: a row for each, with a column for each quantity that an effect draws.
+
+    pandas, DuckDB and the like query it.
+
+    Args:
+        severity: of the scene; None if it has none.
+    """
+
+    def __init__(self, severity: int | None):
+        self._severity = severity
+        self._rows, self._tables = list[dict[str, Any]](), list[pa.Table]()
+
+    def add(self, row: PairRow) -> None:
+        """Add a row of the manifest that has a pair."""
+        self._rows.append(self._columns(row))
+        if len(self._rows) == _BATCH:
+            self._flush()
+
+    def write(self, out: Path) -> None:
+        """Write the table into the folder of the set, sorted by number."""
+        self._flush()
+        table = pa.concat_tables(self._tables, promote_options="permissive").sort_by("number")
+        drawn = sorted(name for name in table.column_names if "." in name)
+        table = table.select([name for name in table.column_names if "." not in name] + drawn)
+        # PyArrow would take a relative path with a colon for an address.
+        with replace_file(out / TABLE) as temporary, temporary.open("wb") as stream:
+            pq.write_table(table, stream, row_group_size=_BATCH)
+
+    def _flush(self) -> None:
+        if self._rows:
+            names = dict.fromkeys(name for row in self._rows for name in row)
+            self._tables.append(pa.table({name: [row.get(name) for row in self._rows] for name in names}))
+            self._rows = []
+
+    def _columns(self, row: PairRow) -> dict[str, Any]:
+        path = next(iter(row.files.values())).path
+        values = {
+            "number": row.number,
+            "name": row.name,
+            "key": row.key,
+            "seed": row.seed,
+            "source": row.source,
+            "frame": row.frame,
+            "drive": row.drive,
+            "split": row.split,
+            "scene": row.scene,
+            "severity": self._severity,
+            "height": row.height,
+            "width": row.width,
+            "effects": [str(effect["effect"]) for effect in row.effects],
+            "path": path if path.endswith(".tar") else path.partition(".")[0],
+            "bytes": sum(file.bytes for file in row.files.values()),
+        }
+        seen = Counter[str]()
+        for effect in row.effects:
+            name = str(effect["effect"])
+            seen[name] += 1
+            prefix = name if seen[name] == 1 else f"{name}{seen[name]}"
+            values |= {f"{prefix}.{key}": _number(value) for key, value in effect.items() if key != "effect"}
+        return values
+
+
+def _number(value: Any) -> Any:
+    """Return the numbers of a parameter; a manifest has words for infinite ones, because JSON has none."""
+    if isinstance(value, list):
+        return [_number(item) for item in value]
+    return float(value) if isinstance(value, str) else value

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrefract._io import make_folder, matching_files, read_bytes, remove_file, replace_file
+from torchrefract._io import make_folder, matching_files, read_bytes, remove_file, write_file
 from torchrefract._validation import UsageError
 
 CONFIG = "config.json"
@@ -64,8 +64,7 @@ def claim(
     document = {"settings": new, "count": count, **about}
     for target in (path, path.with_name(f"config{suffix}.json")) if suffix else (path,):
         if document != previous or not target.is_file():
-            with replace_file(target) as temporary:
-                temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+            write_file(target, json.dumps(document, indent=2) + "\n")
     return previous
 
 
@@ -114,7 +113,7 @@ def _has_valid_values(config: Mapping[str, Any]) -> bool:
 
 def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     """Describe how settings differ; empty if they are equal."""
-    before, after = dict(_flatten(first)), dict(_flatten(second))
+    before, after = dict(flatten(first)), dict(flatten(second))
     different = [name for name in before | after if before.get(name) != after.get(name)]
     shown = [
         f"{name} is {before.get(name)} {of_first} and {after.get(name)} {of_second}" for name in different[:_SHOWN]
@@ -122,9 +121,10 @@ def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     return ", ".join(shown) + (f", and {len(different) - _SHOWN} more" if len(different) > _SHOWN else "")
 
 
-def _flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the names, joined by dots, and the values of nested mappings."""
     if isinstance(value, Mapping):
         for name, part in value.items():
-            yield from _flatten(part, f"{prefix}.{name}" if prefix else str(name))
+            yield from flatten(part, f"{prefix}.{name}" if prefix else str(name))
     else:
         yield prefix, value

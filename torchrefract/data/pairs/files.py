@@ -15,7 +15,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from torchrefract.data.depth_maps import depth_levels, depth_of_levels
+from torchrefract.data.depth_maps import depth_of_levels, map_levels
 from torchrefract.data.images import has_complete_png_chunks
 
 _T = TypeVar("_T")
@@ -161,7 +161,7 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
     if name in MASKS:
         return _encode_png(value.astype(np.uint8) * 255, _MAP_OPTIONS)
     if name == DEPTH:
-        return _encode_png(depth_levels(value), _MAP_OPTIONS)
+        return _encode_png(map_levels(value, lowest=1), _MAP_OPTIONS)
     levels = np.rint(value * LIGHTS[name])
     if not ((levels >= 0) & (levels <= _LAST_LEVEL)).all():
         limit = f"{_LAST_LEVEL / LIGHTS[name]:.3g}"

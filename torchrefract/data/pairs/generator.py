@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import make_folder, replace_file
+from torchrefract._io import make_folder, replace_file, write_file
 from torchrefract._validation import UsageError
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.depth_maps import DepthFolder
@@ -269,8 +269,7 @@ class PairStorage(NamedTuple):
         for suffix, data in pair.data.items():
             files[suffix] = file = pair.row.files[suffix]._replace(path=f"{folder}/{pair.row.name}.{suffix}")
             make_folder(self.out / folder)
-            with replace_file(self.out / file.path, alone=True) as temporary:
-                temporary.write_bytes(data)
+            write_file(self.out / file.path, data, alone=True)
         return pair.row._replace(files=files)
 
 

@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
-from torchrefract._io import is_remote, matching_files, remove_file, replace_file
+from torchrefract._io import is_remote, matching_files, remove_file, replace_file, write_file
 from torchrefract._validation import UsageError
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.pairs.configuration import remove_shard_config, shard_suffix
@@ -246,8 +246,7 @@ class Manifest:
         """Write the rows that `add` has collected."""
         lines, self._last = "".join(row.as_line() for row in self._rows).encode(), time.monotonic()
         if is_remote(self.path) and lines:
-            with replace_file(self.path.with_name(f"{self.path.stem}.{self._parts:06d}.jsonl")) as temporary:
-                temporary.write_bytes(lines)
+            write_file(self.path.with_name(f"{self.path.stem}.{self._parts:06d}.jsonl"), lines)
             self._parts += 1
         elif lines:
             with self.path.open("ab") as stream:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from torchrefract._io import is_remote, read_bytes, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, list_names, select_val_drives, split_frames
+from torchrefract.data.frames import Source, evenly_spaced, list_names, select_val_drives, split_frames
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
 from torchrefract.data.media import VIDEOS, video_info
 from torchrefract.random import key_of
@@ -51,10 +51,9 @@ class Sources(NamedTuple):
 
     def limited(self, count: int) -> "Sources":
         """Keep at most `count` frames, evenly spaced."""
-        total = self.num_frames
-        if count >= total:
+        if count >= self.num_frames:
             return self
-        return self._replace(table=self.table.take([i * total // count for i in range(count)]))
+        return self._replace(table=self.table.take(evenly_spaced(self.num_frames, count)))
 
     def digest(self) -> str:
         """Return a SHA-256 digest of the names, drives, splits and sizes of the files."""

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchrefract._validation import warn
+from torchrefract._validation import check_rgb, warn
 from torchrefract.warping.grid import pixel_axes
 
 _STRIDE = 32
@@ -115,8 +115,7 @@ class CoordConvSegmenter(nn.Module):
         Raises:
             ValueError: the image has another shape.
         """
-        if image.ndim != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        check_rgb("image", image)
         height, width = image.shape[2:]
         inputs = torch.cat([(image - self.mean) / self.std, pixel_coordinates(image)], dim=1)
         inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrefract._validation import check_count
+from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.warping.grid import field_dtype
 
@@ -60,8 +60,7 @@ class FogNet(nn.Module):
         Raises:
             ValueError: the image has another shape.
         """
-        if image.ndim != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        check_rgb("image", image)
         height, width = image.shape[2:]
         airlight = airlight_in_fog(image)[:, :, None, None]
         difference = image - airlight

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrefract._validation import check_count
+from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_axes, full_precision, pixel_coordinates
 
 _CELL = 4  # px
@@ -74,8 +74,7 @@ class LensEncoder(nn.Module):
         Raises:
             ValueError: the image has another shape.
         """
-        if image.ndim != 4 or image.shape[1] != 3:
-            raise ValueError(f"image must have shape (B, 3, H, W), got {tuple(image.shape)}")
+        check_rgb("image", image)
         with full_precision(image):
             edges, features = find_edges(image.float())
             weights = F.softplus(self.weights(features)).flatten(2) * edges.strength[:, None]

@@ -1,20 +1,28 @@
-"""The stored scores of a run of the command robustness, by which it continues, and beside which another is compared."""
+"""Scenes of a run of the command robustness, and its stored scores, by which it continues or is compared."""
 
+import hashlib
+import inspect
 import json
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 import torchrefract
 from torchrefract import presets
-from torchrefract._io import replace_file
+from torchrefract._io import CONFIG_DIR, write_file
 from torchrefract._validation import UsageError, first_names
+from torchrefract.cli.command import print_warning
+from torchrefract.cli.options import naming
+from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
+from torchrefract.robustness.predictors import import_function
 from torchrefract.robustness.quantities import QUANTITIES
 
 SCORES = "scores.jsonl"  # one line of settings, then one for each picture
@@ -22,6 +30,8 @@ FORMAT = 2  # of these lines; 1 had no summaries of predictions
 _VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 # Settings that a base shares, besides its data, scenes and severities.
 _SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "effects", "format")
+_SUFFIXES = (".yaml", ".yml")
+REFERENCE_WIDTH = 1920  # px, of frames for which scenes are described; their quantities do not depend on it
 
 
 @contextmanager
@@ -41,8 +51,7 @@ def stored_scores(
             )
         _check_versions(before.get("versions") or {})
     done = dict(map(parse_scores, lines[1:]))
-    with replace_file(path, alone=True) as repaired:
-        repaired.write_text("".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", encoding="utf-8")
+    write_file(path, "".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", alone=True)
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
@@ -75,7 +84,7 @@ def read_base(path: Path, settings: Mapping[str, Any], names: Iterable[str]) -> 
     version = (before.get("versions") or {}).get("torchrefract", "of an unknown version")
     if version != torchrefract.__version__:
         text = f"torchrefract {version}, this is {torchrefract.__version__}: its pictures may differ"
-        print(f"warning: base was run with {text}", file=sys.stderr)
+        print_warning(f"base was run with {text}")
     levels, of_images = next(iter(scored.values())).levels, scored.values()
     result = Robustness(
         names=list(scored),
@@ -92,7 +101,7 @@ def _check_versions(before: Mapping[str, str]) -> None:
     version = before.get("torchrefract")
     if version is None:
         text = f"an unknown version of torchrefract and continues with {torchrefract.__version__}: draws may differ"
-        print(f"warning: out was begun by {text}", file=sys.stderr)
+        print_warning(f"out was begun by {text}")
     elif version != torchrefract.__version__:
         raise UsageError(
             f"out must be a folder of a run of torchrefract {torchrefract.__version__}, got one of {version}, whose "
@@ -100,7 +109,7 @@ def _check_versions(before: Mapping[str, str]) -> None:
         )
     elif before["torch"] != torch.__version__:
         text = f"{before['torch']} and continues with {torch.__version__}: last digits may differ"
-        print(f"warning: out was begun with torch {text}", file=sys.stderr)
+        print_warning(f"out was begun with torch {text}")
 
 
 def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -133,3 +142,84 @@ def levels_of(scenes: Any, severities: Any) -> list[Level]:
     if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
         raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
     return [Level(str(name), int(severity)) for name in names for severity in severities]
+
+
+def make_scenes(levels: Iterable[Level], width: int, place: Mapping[str, Any]) -> dict[str, dict[int, Effect]]:
+    """Create the effects of levels for frames of a width, px.
+
+    Args:
+        levels: a scene is a name in conf/scene, a YAML file like those, or package.module:function.
+        width: given to scenes that take one.
+        place: camera and horizon, as far as they are given, likewise.
+
+    Raises:
+        UsageError: an unknown scene; one that is no effect; one without a severity for several of them.
+    """
+    severities: dict[str, list[int]] = {}
+    for level in levels:
+        severities.setdefault(level.scene, []).append(level.severity)
+    return {name: _effects(name, of, {"width": width, **place}) for name, of in severities.items()}
+
+
+def describe_scenes(levels: Iterable[Level]) -> dict[str, str] | None:
+    """Return a digest of the parameters of each scene that is not of torchrefract, by name; None without any."""
+    effects = make_scenes((level for level in levels if not _shipped(level.scene).is_file()), REFERENCE_WIDTH, {})
+    texts = {name: repr(list(by.items())) for name, by in effects.items()}
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in texts.items()} or None
+
+
+def _shipped(name: str) -> Path:
+    return Path(CONFIG_DIR, "scene", f"{name}.yaml")
+
+
+def _effects(name: str, severities: Sequence[int], arguments: Mapping[str, Any]) -> dict[int, Effect]:
+    module, _, function = name.partition(":")
+    config = {} if function else _read_scene(name)
+    if len(severities) > 1 and "_target_" in config and "severity" not in config:
+        raise UsageError(
+            f"scene must have a severity if several are scored, got {name} without one; write an effect below each "
+            "severity, as in 1: {_target_: ...}, or pass one severity"
+        )
+    with naming("scene"):
+        if function:
+            make = import_function(module, function)
+            given = _accepted(arguments, inspect.signature(make).parameters)
+            effects = {severity: make(severity, **given) for severity in severities}
+        else:
+            effects = {severity: _from_config(config, name, severity, arguments) for severity in severities}
+    for effect in effects.values():
+        if not isinstance(effect, Effect):
+            raise UsageError(f"scene must be an effect of torchrefract, got {type(effect).__name__} of {name}")
+    return effects
+
+
+def _from_config(config: dict[Any, Any], name: str, severity: int, arguments: Mapping[str, Any]) -> Any:
+    if "_target_" not in config and severity not in config:
+        raise ValueError(f"{name} must hold the _target_ of an effect, or one for severity {severity}, got neither")
+    config = config if "_target_" in config else config[severity]
+    try:
+        # A camera is no value of a configuration.
+        return instantiate(config | {"_partial_": True})(**_accepted({"severity": severity, **arguments}, config))
+    except InstantiationException as error:
+        raise error.__cause__ or error from None
+
+
+def _accepted(arguments: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    names = set(names)
+    return {name: value for name, value in arguments.items() if name in names}
+
+
+def _read_scene(name: str) -> dict[Any, Any]:
+    file = Path(name).expanduser()
+    if file.suffix not in _SUFFIXES:
+        file = _shipped(name)
+    if not file.is_file():
+        raise UsageError(
+            f"scene must be some of {', '.join(QUANTITIES)}, a file .yaml, or package.module:function, got {name}"
+        )
+    config: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+    if not isinstance(config, dict):
+        raise UsageError(
+            f"scene must be a mapping with the _target_ of an effect, got {type(config).__name__} in {file}"
+        )
+    return config

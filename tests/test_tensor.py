@@ -1,14 +1,17 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 from torch.testing import assert_close
 
 from torchrefract import Compose, LensFlare, _tensor
 from torchrefract._tensor import (
-    cat_bands,
     exact_matmul,
     highest_nearby,
+    in_bands,
     interpolate_channels,
     round_to_dtype,
     rows_at_once,
@@ -70,30 +73,33 @@ def test_uint8_images_pass_through_one_graph():
 
 @pytest.mark.quick
 @pytest.mark.parametrize("dim", [1, 2])
-@pytest.mark.parametrize("sizes", [[5], [2, 2, 1]])
-def test_bands_are_concatenated_in_order(dim, sizes):
+@pytest.mark.parametrize("band", [9, 5, 2])
+def test_bands_are_concatenated_in_order(dim, band):
     values = torch.randn(2, 5, 5)
-    assert torch.equal(cat_bands(values.split(sizes, dim=dim), dim=dim, length=5), values)
+    part = partial(slice_of, values, dim)
+    assert torch.equal(in_bands(part, length=5, band=band, dim=dim), values)
 
 
 def test_a_band_is_copied_before_the_next_one_is_made():
     memory = torch.empty(1, 2)
-    bands = (memory.fill_(i) for i in range(3))
-    assert cat_bands(bands, dim=0, length=3).tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert in_bands(lambda i, _: memory.fill_(i), length=3, band=1, dim=0).tolist() == [[0, 0], [1, 1], [2, 2]]
 
 
 def test_gradients_reach_every_band():
-    bands = [torch.randn(2, 3, requires_grad=True) for _ in range(3)]
-    weights = torch.randn(6, 3)
-    (cat_bands(bands, dim=0, length=6) * weights).sum().backward()
-    for i, band in enumerate(bands):
-        assert band.grad is not None
-        assert torch.equal(band.grad, weights[2 * i : 2 * i + 2])
+    values, weights = torch.randn(5, 3, requires_grad=True), torch.randn(5, 3)
+    (in_bands(partial(slice_of, values, 0), length=5, band=2, dim=0) * weights).sum().backward()
+    assert values.grad is not None
+    assert torch.equal(values.grad, weights)
 
 
 def test_bands_are_concatenated_under_vmap():
     values = torch.randn(4, 6, 3)
-    assert torch.equal(torch.vmap(lambda value: cat_bands(value.split(2), dim=0, length=6))(values), values)
+    banded = torch.vmap(lambda value: in_bands(partial(slice_of, value, 0), length=6, band=2, dim=0))(values)
+    assert torch.equal(banded, values)
+
+
+def slice_of(values: Tensor, dim: int, start: int, stop: int) -> Tensor:
+    return values.narrow(dim, start, stop - start)
 
 
 @pytest.mark.parametrize(("each", "expected"), [(0, 64), (1, 64), (9, 7), (64, 1), (65, 1)])

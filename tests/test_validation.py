@@ -21,7 +21,6 @@ from torchrefract._validation import (
     check_tensor,
     check_values,
     check_within,
-    eager_bool,
     eager_values,
 )
 
@@ -127,7 +126,7 @@ def test_values_on_a_device_are_not_computed():
         computed.append(value)
         return value
 
-    assert eager_bool(lambda: record(on_meta).all(), of=on_meta) is None
+    assert eager_values(lambda: record(on_meta).all(), of=on_meta) is None
     assert eager_values(lambda: record(on_meta), of=on_meta) is None
     check_values("depth", "be above 0, in m", on_meta, lambda value: record(value) > 0)
     assert computed == []
@@ -145,9 +144,9 @@ def test_values_are_not_checked_while_compiling_or_inside_vmap():
     assert torch.equal(torch.vmap(check_and_add)(torch.tensor([[-1.0], [1.0]])), torch.tensor([[0.0], [2.0]]))
 
 
-def test_eager_bool_returns_the_value_of_a_tensor_on_the_cpu():
-    assert eager_bool(lambda: torch.tensor(True)) is True
-    assert eager_bool(lambda: torch.tensor(False)) is False
+def test_eager_values_returns_one_value_as_a_bool():
+    assert eager_values(lambda: torch.tensor(True)) is True
+    assert eager_values(lambda: torch.tensor(False)) is False
 
 
 def test_a_warning_names_the_line_of_the_caller_whatever_calls_the_effect():

@@ -1,11 +1,10 @@
 """Small operations on tensors that several packages share."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import lru_cache, wraps
-from itertools import chain
 from typing import Any, TypeVar, cast
 
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract._validation import requires_grad
+from torchrefract.types import Range
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _CACHED_VALUES = 1 << 17  # float32 values that fit into the cache of one core
@@ -56,25 +56,6 @@ def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
     return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
-def cached(function: _F) -> _F:
-    """Keep the latest 16 results of a function on the CPU.
-
-    The arguments must be hashable and the last one must be the device. The results must not be written to.
-    """
-
-    @lru_cache(maxsize=16)
-    def once(*args: Any) -> Any:
-        # Tensors made in inference mode cannot be used outside of it.
-        with torch.inference_mode(False), torch.no_grad():
-            return function(*args)
-
-    @wraps(function)
-    def result(*args: Any) -> Any:
-        return (function if torch.compiler.is_compiling() or args[-1].type != "cpu" else once)(*args)
-
-    return cast(_F, result)
-
-
 @contextmanager
 def sharing_results() -> Iterator[None]:
     """Keep the results of `shareable` functions, in this thread, until the end of the block."""
@@ -115,6 +96,13 @@ def _is_equal(value: Any, other: Any) -> bool:
     return type(value) is type(other) and value == other
 
 
+def in_ranges(values: Tensor, ranges: Sequence[Range]) -> Tensor:
+    """Return (), bool: all values (B, n) lie in the n ranges, up to rounding."""
+    low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
+    margin = 1e-5 * torch.maximum(low.abs(), high.abs())
+    return ((values >= low - margin) & (values <= high + margin)).all()
+
+
 def expand_batch(value: Tensor, batch: int) -> Tensor:
     """Repeat each row of (B, ...) for the T frames of its clip, so that `batch` = B T rows result.
 
@@ -127,23 +115,24 @@ def expand_batch(value: Tensor, batch: int) -> Tensor:
     return value.repeat_interleave(batch // value.shape[0], dim=0)
 
 
-def cat_bands(bands: Iterable[Tensor], *, dim: int, length: int) -> Tensor:
-    """Concatenate bands along a dimension of the given total length.
+def in_bands(compute: Callable[[int, int], Tensor], *, length: int, band: int, dim: int) -> Tensor:
+    """Compute a tensor of a length along a dimension in bands, each from one index to another.
 
     Without gradients each band is copied before the next one is made, so that all bands use the same memory.
     """
-    iterator = iter(bands)
-    first = next(iterator)
-    if first.shape[dim] == length:
+    first = compute(0, min(band, length))
+    if band >= length:
         return first
+    starts = range(band, length, band)
     if torch._C._are_functorch_transforms_active() or (first.requires_grad and torch.is_grad_enabled()):
-        return torch.cat([first, *iterator], dim=dim)
+        return torch.cat([first, *(compute(start, min(start + band, length)) for start in starts)], dim=dim)
     shape = list(first.shape)
     shape[dim] = length
-    result, start = first.new_empty(shape), 0
-    for band in chain([first], iterator):
-        result.narrow(dim, start, band.shape[dim]).copy_(band)
-        start += band.shape[dim]
+    result = first.new_empty(shape)
+    result.narrow(dim, 0, band).copy_(first)
+    for start in starts:
+        size = min(band, length - start)
+        result.narrow(dim, start, size).copy_(compute(start, start + size))
     return result
 
 

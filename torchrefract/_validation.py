@@ -138,7 +138,7 @@ def check_values(name: str, condition: str, value: Tensor, test: Callable[[Tenso
 
     On an accelerator, under `torch.compile` and inside `torch.vmap` nothing is read; the effects mask the result there.
     """
-    if eager_bool(lambda: test(value).all(), of=value) is False:
+    if eager_values(lambda: test(value).all(), of=value) is False:
         wrong = value.detach()[~test(value.detach())].flatten()
         raise ValueError(f"{name} must {condition}, got {wrong[0].item():g}")
 
@@ -155,19 +155,8 @@ def is_whole(value: Tensor) -> bool:
     return not (value.is_floating_point() or value.is_complex() or value.dtype is torch.bool)
 
 
-def eager_bool(predicate: Callable[[], Tensor], *, of: Tensor | None = None) -> bool | None:
-    """Return a one-element tensor as a bool, or None if that would wait for a device or break a graph.
-
-    Args:
-        predicate: computes the tensor.
-        of: as for `eager_values`.
-    """
-    values = eager_values(predicate, of=of)
-    return None if values is None else bool(values)
-
-
 def eager_values(tensor: Callable[[], Tensor], *, of: Tensor | None = None) -> Any:
-    """Return the elements of a tensor as a number or nested lists, or None if reading them would wait for a device.
+    """Return the value of a tensor, a bool, a number or nested lists, or None if reading it would wait for a device.
 
     Args:
         tensor: computes the tensor.

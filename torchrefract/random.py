@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cat_bands
+from torchrefract._tensor import as_device_tensor, in_bands, rows_at_once
 from torchrefract._validation import why_not_eager
 from torchrefract.types import Range
 
@@ -27,7 +27,6 @@ _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
 # Odd constants of the hash, as int32: 2^32 over the golden ratio, and the two of lowbias32.
 _HASH = (0x9E3779B1 - 2**32, 0x7FEB352D, 0x846CA68B - 2**32)
-_FEW = 12  # counters, up to which Python's integers are faster than NumPy's arrays
 _BAND = 1 << 17  # numbers whose intermediate results stay in a processor's cache
 
 
@@ -118,13 +117,12 @@ def uniform_in_ranges(source: Stream, ranges: Sequence[Range], *, dtype: torch.d
         ranges: n of them.
         dtype: float32 or float64.
     """
-    ends = [float(end) for span in ranges for end in span]
     u = _uniform(source, len(ranges))
     if isinstance(u, Tensor):
-        low, high = as_device_tensor(ends, dtype=dtype, device=u.device).unflatten(0, (-1, 2)).unbind(1)
+        low, high = as_device_tensor(ranges, dtype=dtype, device=u.device).view(-1, 2).unbind(1)
         return _drawn(low + (high - low) * u.to(dtype), source)
     kind = np.float64 if dtype is torch.float64 else np.float32
-    low, high = np.array(ends, kind).reshape(-1, 2).T
+    low, high = np.array(ranges, kind).reshape(-1, 2).T
     return _drawn(low + (high - low) * u.astype(kind), source)
 
 
@@ -159,14 +157,12 @@ def white_noise(key: Tensor, count: int, *, start: int = 0) -> Tensor:
         count: number of pairs of a sample.
         start: number of the first pair.
     """
-    if torch.compiler.is_compiling() or key.device.type != "cpu":
-        return white_noise_at(key, torch.arange(start, start + count, device=key.device))
-    band = max(1, _BAND // max(1, len(key)))
-    bands = (
-        white_noise_at(key, torch.arange(start + first, start + min(first + band, count), device=key.device))
-        for first in range(0, max(1, count), band)
-    )
-    return cat_bands(bands, dim=2, length=count)
+    band = rows_at_once(key.device, count, each=len(key), cached=_BAND)
+
+    def pairs(first: int, last: int) -> Tensor:
+        return white_noise_at(key, torch.arange(start + first, start + last, device=key.device))
+
+    return in_bands(pairs, length=count, band=band, dim=2)
 
 
 def white_noise_at(key: Tensor, indices: Tensor) -> Tensor:
@@ -216,11 +212,8 @@ def _threefry(keys: Any, counters: Any) -> Any:
         if torch.compiler.is_compiling():
             return torch.ops.torchrefract.threefry(keys, counters)
         return torch.stack(_rounds(*keys[:, :, None], *counters))
-    # NumPy starts each of the hundred operations several times as fast as PyTorch, and Python those on a few integers.
-    if keys.shape[1] * counters.shape[1] > _FEW:
-        return np.stack(_rounds(*keys[:, :, None], *counters))
-    pairs = [_rounds(*key, *counter) for key in keys.T.tolist() for counter in counters.T.tolist()]
-    return np.array(pairs, np.int64).reshape(keys.shape[1], counters.shape[1], 2).transpose(2, 0, 1)
+    # NumPy starts each of the hundred operations several times as fast as PyTorch.
+    return np.stack(_rounds(*keys[:, :, None], *counters))
 
 
 @torch.library.custom_op("torchrefract::threefry", mutates_args=())

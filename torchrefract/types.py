@@ -6,6 +6,7 @@ Transmission: the share of the scene's light that reaches the camera, in [0, 1].
 Extinction: the rate at which fog attenuates light, 1/m.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,6 +29,10 @@ class Inverse(NamedTuple):
     valid: Tensor  # (B, 1, H, W), bool: the inverse exists and was computed
 
 
+def _infinite(strides: np.ndarray) -> np.ndarray:
+    return np.full(np.shape(strides), np.inf)
+
+
 @dataclass(frozen=True)
 class FlowBounds:
     """Upper bounds for all flows of an error model, over the frame and a margin around it.
@@ -39,8 +44,8 @@ class FlowBounds:
     """
 
     max_displacement: float
-    max_gradient: float
-    interpolation_error: Callable[[np.ndarray], np.ndarray]
+    max_gradient: float = math.inf
+    interpolation_error: Callable[[np.ndarray], np.ndarray] = _infinite
 
 
 class Simplification(NamedTuple):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import eager_bool, eager_values, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.cameras.radial import RADIAL, RadialLimit, factor_and_slope, newton_radius, radial_factor
 from torchrefract.warping.flow import Jacobian
 
@@ -194,7 +194,7 @@ def converge(point: Point, target: Point, distort: Callable[[Tensor, Tensor], tu
         step = torch.maximum((new_x - x).abs(), (new_y - y).abs())
         x, y = torch.where(is_done, x, new_x), torch.where(is_done, y, new_y)
         is_done = is_done | (step <= _SMALL_STEP[step.dtype])
-        all_done = eager_bool(is_done.all, of=step)
+        all_done = eager_values(is_done.all, of=step)
         if all_done or (all_done is None and count == _BLIND_NEWTON_STEPS):
             break
     return x, y

@@ -2,7 +2,7 @@
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 from weakref import WeakKeyDictionary
 
@@ -14,9 +14,10 @@ from torchrefract import random
 from torchrefract._validation import (
     check_count,
     check_number,
+    check_range,
     check_values,
     check_whole,
-    eager_bool,
+    eager_values,
     is_whole,
     requires_grad,
 )
@@ -282,7 +283,7 @@ class Effect(nn.Module, ABC):
     def may_change(self, params: Any) -> bool:
         """Return False if no sample changes; True if one does, if that cannot be read, or if gradients are needed."""
         active = params.applied & ~params.is_identity
-        return eager_bool(active.any, of=active) is not False or requires_grad(params)
+        return eager_values(active.any, of=active) is not False or requires_grad(params)
 
     def check_params(self, params: Any, image: Tensor) -> None:
         """Raise unless these are valid parameters of this effect for images (B, C, H, W).
@@ -309,6 +310,15 @@ class Effect(nn.Module, ABC):
         """Draw `applied`, (B,), bool, with probability `p`, and a uniform value in each of n ranges, (B, n)."""
         values = random.uniform_in_ranges(stream, [(0.0, 1.0), *ranges], dtype=field_dtype(image.dtype))
         return values[:, 0].float() < self.p, values[:, 1:]
+
+    def _set_ranges(self, ranges: Mapping[str, Range], bounds: Mapping[str, Range]) -> None:
+        """Set the attribute `<name>_range` for each name, after a check against the bounds of the name."""
+        for name, value in ranges.items():
+            low, high = bounds[name]
+            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=low, high=high))
+
+    def _range(self, name: str) -> Range:
+        return getattr(self, f"{name}_range")
 
     def extra_repr(self) -> str:
         """Show the arguments in the representation of the module."""

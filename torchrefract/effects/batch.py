@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
-from torchrefract._validation import check_tensor, check_within, eager_bool, requires_grad, warn, why_not_eager
+from torchrefract._validation import check_tensor, check_within, eager_values, requires_grad, warn, why_not_eager
 from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.warping.grid import field_dtype
 
@@ -236,11 +236,8 @@ def params_per_frame(params: Any, frames: int) -> Any:
     """Repeat the parameters of B clips for their T frames: B T rows, each with one frame number."""
     if frames == 1:
         return params
-    if "frame" in params._fields:
-        frame = params.frame.reshape(-1, 1)
-        repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
-        return repeated._replace(frame=frame)
-    return map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+    repeated = map_params(params, lambda value: value.repeat_interleave(frames, dim=0))
+    return repeated._replace(frame=params.frame.reshape(-1, 1)) if "frame" in params._fields else repeated
 
 
 class ParamsAtDepth(NamedTuple):
@@ -346,7 +343,7 @@ def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, par
         active: (N,) or (B,), bool.
         params: with B or N rows; needs `applied` and, for gradients, its tensors.
     """
-    if eager_bool(active.all, of=active):
+    if eager_values(active.all, of=active):
         return changed
     rows = changed.shape[0]
     shape = (-1, *[1] * (changed.ndim - 1))

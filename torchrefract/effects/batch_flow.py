@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points
@@ -41,8 +41,8 @@ class SamplingOptions(NamedTuple):
     interpolation: str | None = None
     backend: str | None = None
 
-    def or_else(self, other: "SamplingOptions") -> "SamplingOptions":
-        """Take the options of another where these are undecided."""
+    def or_else(self, other: Any) -> "SamplingOptions":
+        """Take the options of a warp, of a composition or of other options where these are undecided."""
         return SamplingOptions(
             self.padding or other.padding, self.interpolation or other.interpolation, self.backend or other.backend
         )
@@ -102,7 +102,7 @@ class WarpFlow:
         selected = WarpFlow(self.evaluate, params, active, self.plan, has_closed_form=self.has_closed_form)
         if self._field is not None:
             nodes = expand_batch(self._field.nodes, len(self.active))[rows]
-            selected._field = self._field.with_nodes(nodes)
+            selected._field = LatticeFlow(nodes, self._field.lattice)
         return selected
 
 
@@ -239,9 +239,9 @@ def _largest_stretch(start: Points, end: Points) -> Tensor:
     """Return (N,), the largest ratio of the distances of neighboring points after and before a map."""
     ratios = []
     for dim in (2, 3):
-        before, after = (
+        before, after = [
             torch.hypot(points.x.detach().diff(dim=dim), points.y.detach().diff(dim=dim)) for points in (start, end)
-        )
+        ]
         ratios.append((after / before.clamp(min=1e-6)).flatten(1).amax(dim=1))
     return torch.maximum(*ratios)
 
@@ -263,7 +263,7 @@ def zero_flow(params: Any, plan: WarpPlan) -> FlowPart:
 
 def can_read(params: Any) -> bool:
     """Return True if the values of parameters can be read without waiting for a device."""
-    return eager_bool(params.applied.any, of=params.applied) is not None
+    return eager_values(params.applied.any, of=params.applied) is not None
 
 
 class BatchFlow:
@@ -281,7 +281,7 @@ class BatchFlow:
     @property
     def is_zero(self) -> bool:
         """Return True if no flow was computed, because none exceeds the tolerance."""
-        return all(part.is_zero for part in self.parts)
+        return all([part.is_zero for part in self.parts])
 
     @property
     def dense(self) -> Tensor:
@@ -314,25 +314,23 @@ class BatchFlow:
             options: all decided.
         """
         chosen = options._asdict()
-        if requires_grad(part.flow.nodes for part in self.parts):
+        if requires_grad([part.flow.nodes for part in self.parts]):
             # Samples that do not move need the gradient of their parameters.
             return where_active(self._sample(image, None, chosen), image, active, params)
-        return self._sample(image, None if eager_bool(active.all, of=active) else active, chosen)
+        return self._sample(image, None if eager_values(active.all, of=active) else active, chosen)
 
     def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
         if len(self.parts) == 1:
             flow = self.parts[0].flow
-            nodes = expand_batch(flow.nodes, image.shape[0])
-            return sample_image(image, flow.with_nodes(nodes), active=active, **options)
+            flow = LatticeFlow(expand_batch(flow.nodes, image.shape[0]), flow.lattice)
+            return sample_image(image, flow, active=active, **options)
         result = torch.empty_like(image)
         frames = image.shape[0] // self.num_rows
         for index, flow, *_ in self.parts:
             assert index is not None  # of several parts
             rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
-            nodes = expand_batch(flow.nodes, len(rows))
-            part = sample_image(
-                image[rows], flow.with_nodes(nodes), active=None if active is None else active[rows], **options
-            )
+            each = LatticeFlow(expand_batch(flow.nodes, len(rows)), flow.lattice)
+            part = sample_image(image[rows], each, active=None if active is None else active[rows], **options)
             # Forward-mode gradients cannot be written into a tensor without any.
             result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
         return result

@@ -14,16 +14,13 @@ from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import check_applied, params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
-from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.progress import Leaf, Progress
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.planning.composition import ComposePlan, CompositionPlan, PlannedWarp, plan_composition
-from torchrefract.planning.plan import TOLERANCE_PX, PlanRequest, WarpPlan, check_tolerance
+from torchrefract.planning.plan import TOLERANCE_PX, PlanRequest, check_tolerance
 from torchrefract.types import Degraded
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS
-
-_UNDECIDED = SamplingOptions()
 
 
 class ComposeParams(NamedTuple):
@@ -79,7 +76,7 @@ class Compose(Effect):
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise TypeError(f"effects must be effects of torchrefract, got {type(effect).__name__}")
-        self.effects = nn.ModuleList(effects)
+        self.effects = cast(Sequence[Effect], nn.ModuleList(effects))
         self.padding = None if padding is None else check_choice("padding", padding, PADDINGS)
         self.interpolation = (
             None if interpolation is None else check_choice("interpolation", interpolation, INTERPOLATIONS)
@@ -90,13 +87,13 @@ class Compose(Effect):
     @property
     def keeps_uint8(self) -> bool:
         """Return True if all effects do."""
-        return all(effect.keeps_uint8 for effect in self._children())
+        return all([effect.keeps_uint8 for effect in self.effects])
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> ComposeParams:
         """Draw the parameters of each effect from a stream of its own."""
         applied, children_applied = self.sample_applied(stream)
         inner = random.fold(stream)
-        children = [effect.sample_params(inner.at(i), image) for i, effect in enumerate(self._children())]
+        children = [effect.sample_params(inner.at(i), image) for i, effect in enumerate(self.effects)]
         return ComposeParams(applied, tuple(map(_restrict, children, children_applied)))
 
     def sample_applied(self, stream: random.Stream) -> tuple[Tensor, list[Tensor]]:
@@ -110,7 +107,7 @@ class Compose(Effect):
             raise ValueError(
                 f"params.children must be those of {len(self.effects)} effects, got {len(params.children)}"
             )
-        for effect, child in zip(self._children(), params.children, strict=True):
+        for effect, child in zip(self.effects, params.children, strict=True):
             effect.check_params(child, image)
 
     def check_params(self, params: Any, image: Tensor) -> None:
@@ -122,9 +119,9 @@ class Compose(Effect):
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """Return the composition with an exact effect wherever parameters lie outside the ranges."""
-        pairs = zip(self._children(), params.children, strict=True)
+        pairs = zip(self.effects, params.children, strict=True)
         effects = [effect.for_params(child, height, width) for effect, child in pairs]
-        if all(new is old for new, old in zip(effects, self._children(), strict=True)):
+        if all(new is old for new, old in zip(effects, self.effects, strict=True)):
             return self
         composition = copy(self)
         composition._modules = {**self._modules, "effects": nn.ModuleList(effects)}
@@ -132,8 +129,7 @@ class Compose(Effect):
 
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> ComposePlan:
         """Return the plan for all parameters in the ranges."""
-        effects = [leaf.effect for leaf in self._leaves()]
-        requests = self._requests(height, width, dtype)
+        effects, requests = self._flat_effects(), self._requests(id(self), height, width, dtype)
         plans: dict[int, Any] = {}
         composed: list[CompositionPlan] = []
         error, stretch = 0.0, 1.0
@@ -157,8 +153,8 @@ class Compose(Effect):
     def degrade_batch(self, image: Tensor, params: ComposeParams, depth: Tensor | None) -> Degraded:
         """Pass the images through all effects."""
         height, width = image.shape[2:]
-        requests = self._constant_requests(id(self), height, width, field_dtype(image.dtype))
-        leaves = [leaf._replace(params=child) for leaf, child in zip(self._leaves(), _flat(params), strict=True)]
+        requests = self._requests(id(self), height, width, field_dtype(image.dtype))
+        leaves = self._leaves(params, SamplingOptions())
         progress = Progress(image, depth, len(params.applied))
         together: list[int] = []  # the places of warps that will be sampled together
         for place, leaf in enumerate(leaves):
@@ -170,28 +166,33 @@ class Compose(Effect):
             if together and (requests[place] is None or leaf.effect.may_change(leaf.params)):
                 self._move(progress, leaves, together, requests)  # the warps before it come first
                 together = []
-            progress.shade(cast(PhotometricEffect, leaf.effect), leaf.params)
+            progress.shade(leaf.effect, leaf.params)
         if together:
             self._move(progress, leaves, together, requests)
         return progress.result(params)
 
     def effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
         """Yield the effects that are not compositions, in order, with their parameters."""
-        for leaf, child in zip(self._leaves(), _flat(params), strict=True):
-            yield leaf.effect, child
+        for leaf in self._leaves(params, SamplingOptions()):
+            yield leaf.effect, leaf.params
 
-    def _leaves(self, outer: SamplingOptions = _UNDECIDED) -> list[Leaf]:
-        """Return the effects that are not compositions, in order, with their options."""
-        options = outer.or_else(SamplingOptions(self.padding, self.interpolation, self.backend))
+    def _flat_effects(self) -> list[Any]:
+        """Return the effects that are not compositions, in order."""
+        effects: list[Any] = []
+        for effect in self.effects:
+            effects += effect._flat_effects() if isinstance(effect, Compose) else [effect]
+        return effects
+
+    def _leaves(self, params: ComposeParams, outer: SamplingOptions) -> list[Leaf]:
+        """Return `_flat_effects` with their parameters, and with the options of the compositions around them first."""
+        options = outer.or_else(self)
         leaves: list[Leaf] = []
-        for effect in self._children():
+        for effect, child in zip(self.effects, params.children, strict=True):
             if isinstance(effect, Compose):
-                leaves += effect._leaves(options)
-            elif isinstance(effect, WarpEffect):
-                of_effect = SamplingOptions(effect.padding, effect.interpolation, effect.backend)
-                leaves.append(Leaf(effect, options.or_else(of_effect)))
+                leaves += effect._leaves(child, options)
             else:
-                leaves.append(Leaf(effect, options))
+                decided = options.or_else(effect) if isinstance(effect, WarpEffect) else options
+                leaves.append(Leaf(effect, child, decided))
         return leaves
 
     def _move(
@@ -205,8 +206,8 @@ class Compose(Effect):
         request = cast(PlanRequest, requests[places[0]])
         frame = request.height, request.width
         moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
-        active = [cast(WarpEffect, leaf.effect).active(leaf.params, *frame) for leaf in moving]
-        moments = [cast(WarpEffect, leaf.effect).moments() for leaf in moving]
+        active = [leaf.effect.active(leaf.params, *frame) for leaf in moving]
+        moments = [leaf.effect.moments() for leaf in moving]
         parts = []
         for k in range(max(map(len, moments))):
             looks = [
@@ -217,7 +218,7 @@ class Compose(Effect):
         middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
         # The share must not depend on the warps that move other samples of the batch. Of several warps it is half as
         # large, since the inverse of one stretches the errors of the others.
-        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        num_warps = len([leaf for leaf in leaves if isinstance(leaf.effect, WarpEffect)])
         num_shares = num_warps if num_warps == 1 else 2 * num_warps
         share_px = None if request.tolerance_px is None else request.tolerance_px / num_shares
         progress.move(moving, active, middle, share_px, exposures=parts)
@@ -232,17 +233,15 @@ class Compose(Effect):
         can_measure: bool = True,
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
-        warps = [(cast(WarpEffect, leaf.effect), leaf.params) for leaf in moving]
-        is_exact = [effect.must_be_exact(params) for effect, params in warps]
         frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
-        can_group = can_measure and not any(requires_grad(params) for _, params in warps)
+        can_group = can_measure and not requires_grad([leaf.params for leaf in moving])
         parts: list[FlowPart] = []
-        for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(warps))))]:
-            chosen = [warps[k] for k in acting]
+        for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(moving))))]:
+            chosen = [moving[k] for k in acting]
+            exact_places = tuple([places[k] for k in acting if moving[k].effect.must_be_exact(moving[k].params)])
             if samples is not None:
-                chosen = [(effect, select_params(params, samples)) for effect, params in chosen]
+                chosen = [leaf._replace(params=select_params(leaf.params, samples)) for leaf in chosen]
             acting_places = tuple([places[k] for k in acting])
-            exact_places = tuple([places[k] for k in acting if is_exact[k]])
             plan = self._constant_plan(
                 id(self), acting_places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
@@ -262,10 +261,10 @@ class Compose(Effect):
         frame = request.height, request.width
         placed: list[Leaf] = []
         for leaf in leaves:
-            effect, depth = cast(WarpEffect, leaf.effect), progress.depth
+            effect, depth = leaf.effect, progress.depth
             params = params_per_frame(leaf.params, progress.frames)
             if placed and depth is not None and effect.depth is not None:
-                active = [cast(WarpEffect, before.effect).active(before.params, *frame) for before in placed]
+                active = [before.effect.active(before.params, *frame) for before in placed]
                 parts = self._parts(placed, places[: len(placed)], active, request, can_measure=False)
                 depth = progress.moved_depth(placed, active, parts)
             elif depth is None:
@@ -273,18 +272,20 @@ class Compose(Effect):
             placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
         return placed
 
-    def _requests(self, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
+    @assume_constant_result
+    def _requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
         """Return for each effect the request of its group of warps, or None if it separates groups.
 
         A photometric effect that may change something separates groups, whatever is drawn, so that a sample does not
         depend on the others of its batch.
         """
-        effects = [leaf.effect for leaf in self._leaves()]
+        effects = self._flat_effects()
         request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64).with_reachable_default()
-        requests: list[PlanRequest | None] = [
-            request if isinstance(effect, WarpEffect) or not _may_change(effect, height, width, dtype) else None
-            for effect in effects
-        ]
+        requests: list[PlanRequest | None] = []
+        for effect in effects:
+            is_separator = not isinstance(effect, WarpEffect) and effect.p > 0
+            is_separator = is_separator and not effect.plan_for_dtype(height, width, dtype).is_identity
+            requests.append(None if is_separator else request)
         if request.tolerance_px is None:
             return tuple(requests)
         request.remaining_px()  # raises for an unreachable tolerance
@@ -299,10 +300,6 @@ class Compose(Effect):
         return tuple(requests)
 
     @assume_constant_result
-    def _constant_requests(self, _: int, height: int, width: int, dtype: torch.dtype) -> tuple[PlanRequest | None, ...]:
-        return self._requests(height, width, dtype)
-
-    @assume_constant_result
     def _constant_plan(
         self,
         _: int,
@@ -313,15 +310,10 @@ class Compose(Effect):
         tolerance_px: float | None,
         is_double: bool,
         can_measure: bool,
-    ) -> "_FlowPlan":
-        leaves, request = self._leaves(), PlanRequest(height, width, tolerance_px, is_double)
-        warps = [cast(WarpEffect, leaves[place].effect) for place in places]
-        effects = [warp.exact() if k in exact_places else warp for k, warp in zip(places, warps, strict=True)]
-        plan = _plan_group(effects, request, can_measure=can_measure)
-        return _FlowPlan(plan.stride, plan.is_smooth, plan.plans)
-
-    def _children(self) -> list[Effect]:
-        return cast(list[Effect], list(self.effects))
+    ) -> CompositionPlan:
+        effects, request = self._flat_effects(), PlanRequest(height, width, tolerance_px, is_double)
+        warps = [effects[place].exact() if place in exact_places else effects[place] for place in places]
+        return _plan_group(warps, request, can_measure=can_measure)
 
 
 class OneOf(Compose):
@@ -364,30 +356,11 @@ class OneOf(Compose):
         return applied, [applied & (chosen == i) for i in range(len(self.effects))]
 
 
-class _FlowPlan(NamedTuple):
-    """The choices of a `CompositionPlan`; torch.compile reads the fields of a constant, but not of dataclasses."""
-
-    stride: int
-    is_smooth: bool
-    plans: tuple[WarpPlan, ...]
-
-
-def _flat(params: Any) -> list[Any]:
-    """Return the parameters of the effects that are not compositions, in order."""
-    if not isinstance(params, ComposeParams):
-        return [params]
-    return [leaf for child in params.children for leaf in _flat(child)]
-
-
 def _restrict(params: Any, applied: Tensor) -> Any:
     """Apply the effect only to samples that the composition around it is applied to."""
     if isinstance(params, ComposeParams):
         return ComposeParams(params.applied & applied, tuple(_restrict(child, applied) for child in params.children))
     return params._replace(applied=params.applied & applied)
-
-
-def _may_change(effect: Effect, height: int, width: int, dtype: torch.dtype) -> bool:
-    return effect.p > 0 and not effect.plan_for_dtype(height, width, dtype).is_identity
 
 
 def _groups(effects: Sequence[Effect], requests: Sequence[PlanRequest | None]) -> list[list[int]]:
@@ -401,9 +374,8 @@ def _groups(effects: Sequence[Effect], requests: Sequence[PlanRequest | None]) -
     return [group for group in groups if group]
 
 
-def _plan_group(effects: Sequence[Effect], request: PlanRequest, *, can_measure: bool = True) -> CompositionPlan:
+def _plan_group(warps: Sequence[WarpEffect], request: PlanRequest, *, can_measure: bool = True) -> CompositionPlan:
     """Plan warps that are sampled together."""
-    warps = cast(Sequence[WarpEffect], effects)
     if len(warps) == 1:
         alone = replace(request, ulps=warps[0].rounding_ulps)
         plan = warps[0].plan_under(alone if alone.is_reachable else replace(alone, tolerance_px=None))
@@ -431,19 +403,16 @@ def _group_samples(active: Sequence[Tensor]) -> list[tuple[Tensor | None, list[i
     ]
 
 
-def _composed_flow(
-    warps: Sequence[tuple[WarpEffect, Any]], plan: _FlowPlan, tolerance_px: float | None
-) -> list[FlowPart]:
+def _composed_flow(warps: Sequence[Leaf], plan: CompositionPlan, tolerance_px: float | None) -> list[FlowPart]:
     """Compute the flow of warps in a row."""
-    first, params = warps[0]
     if len(warps) == 1:
-        return first.flow_parts(params, plan.plans[0])
+        return warps[0].effect.flow_parts(warps[0].params, plan.plans[0])
     flows = [
-        effect.warp_flow(params, each)
-        for (effect, params), each in zip(warps, plan.plans, strict=True)
-        if each.stride > 0 or requires_grad(params)
+        leaf.effect.warp_flow(leaf.params, each)
+        for leaf, each in zip(warps, plan.plans, strict=True)
+        if each.stride > 0 or requires_grad(leaf.params)
     ]
     if not flows:
-        return [zero_flow(params, plan.plans[0])]
+        return [zero_flow(warps[0].params, plan.plans[0])]
     options = {"is_smooth": plan.is_smooth, "tolerance_px": tolerance_px or 0.0}
     return flow_on_measured_lattice(flows, stride=plan.stride, **options)

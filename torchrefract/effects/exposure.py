@@ -13,7 +13,7 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
+    eager_values,
     finite_or,
     requires_grad,
 )
@@ -165,7 +165,7 @@ class Exposure(PhotometricEffect):
         """Return False if no sample has noise, as far as that is known without waiting for a device."""
         if requires_grad((params.shot, params.read)):
             return True
-        is_noisy = eager_bool(((params.shot > 0) | (params.read > 0)).any, of=params.shot)
+        is_noisy = eager_values(((params.shot > 0) | (params.read > 0)).any, of=params.shot)
         return self.shot_range[1] + self.read_range[1] > 0 if is_noisy is None else is_noisy
 
 

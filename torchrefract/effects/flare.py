@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, assume_constant_result, expand_batch
+from torchrefract._tensor import as_device_tensor, assume_constant_result, expand_batch, in_ranges
 from torchrefract._validation import (
     check_choice,
     check_color,
@@ -23,12 +23,13 @@ from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
-from torchrefract.fields.srgb import color_per_channel
-from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_flare
+from torchrefract.fields.srgb import color_of_images
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, plan_flare
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
 _FARTHEST = 1e4  # widths and heights
+_PLACES = ("center_x", "center_y", "drift_x", "drift_y")
 _ROUNDING = 2e-5  # relative, of drawn values
 
 
@@ -100,9 +101,8 @@ class LensFlare(PhotometricEffect):
         p: float = 1.0,
     ):
         super().__init__(tolerance=tolerance, p=p)
-        places = {"center_x": center_x_range, "center_y": center_y_range}
-        for name, value in {**places, "drift_x": drift_x_range, "drift_y": drift_y_range}.items():
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=-_FARTHEST, high=_FARTHEST))
+        given = (center_x_range, center_y_range, drift_x_range, drift_y_range)
+        self._set_ranges(dict(zip(_PLACES, given, strict=True)), dict.fromkeys(_PLACES, (-_FARTHEST, _FARTHEST)))
         self.radius_range = check_range("radius_range", radius_range, low=0.0, high=_FARTHEST)
         self.strength_range = check_range("strength_range", strength_range, low=0.0, high=1e3)
         self.color = check_color("color", color, high=1e3)
@@ -111,10 +111,9 @@ class LensFlare(PhotometricEffect):
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> FlareParams:
         """Draw all parameters uniformly in their ranges."""
-        places = [getattr(self, f"{name}_range") for name in ("center_x", "center_y", "drift_x", "drift_y")]
+        places = [self._range(name) for name in _PLACES]
         applied, values = self.draw_in_ranges(stream, [*places, self.radius_range, self.strength_range], image)
-        colors = [color_per_channel("color", self.color, image.shape[1])] * image.shape[0]
-        color = as_device_tensor(colors, dtype=values.dtype, device=values.device).view(image.shape[:2])
+        color = color_of_images("color", self.color, image, values.dtype)
         frame = torch.zeros_like(values[:, :1])
         return FlareParams(applied, values[:, :2], values[:, 4], values[:, 5], color, values[:, 2:4], frame)
 
@@ -131,10 +130,10 @@ class LensFlare(PhotometricEffect):
 
     def params_in_range(self, params: FlareParams) -> Tensor:
         """Return (), bool: all parameters lie in the ranges."""
-        names = ("center_x", "center_y", "radius", "strength", "drift_x", "drift_y")
-        values = torch.stack([*params.center.T, params.radius, params.strength, *params.drift.T], dim=1)
+        values = torch.stack([*params.center.T, *params.drift.T, params.radius, params.strength], dim=1)
         colors = [(min(self.color), max(self.color))] * params.color.shape[1]
-        return in_ranges(values, [getattr(self, f"{name}_range") for name in names]) & in_ranges(params.color, colors)
+        ranges = [self._range(name) for name in (*_PLACES, "radius", "strength")]
+        return in_ranges(values, ranges) & in_ranges(params.color, colors)
 
     def make_plan(self, request: PhotometricRequest, *, has_depth: bool) -> PhotometricPlan:
         """Plan images by the largest light that the ranges add to a pixel; flare does not depend on depth."""
@@ -145,11 +144,9 @@ class LensFlare(PhotometricEffect):
         size = (request.width, request.height)
         radius = max(self.radius_range[1] * math.hypot(*size) * (1 + _ROUNDING), 1e-6)
         # The sun moves up to the latest frame of a clip, and is some distance from the nearest pixel there.
-        center_ranges, drift_ranges = (
-            [getattr(self, f"{name}_{axis}_range") for axis in "xy"] for name in ("center", "drift")
-        )
-        moved = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in drift_ranges]
-        centers = [(low - drift, high + drift) for (low, high), drift in zip(center_ranges, moved, strict=True)]
+        places = [self._range(name) for name in _PLACES]
+        moved = [latest * max(map(abs, ends)) if any(ends) else 0.0 for ends in places[2:]]
+        centers = [(low - drift, high + drift) for (low, high), drift in zip(places[:2], moved, strict=True)]
         distance = math.hypot(*map(_distance_from_frame, centers, size))
         light = self.strength_range[1] * max(self.color) * (1 + _ROUNDING)
         light *= math.exp(-0.5 * (distance / radius) ** 2) if self.radius_range[1] > 0 else 0.0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, cached_constant, expand_batch
+from torchrefract._tensor import as_device_tensor, cached_constant, expand_batch, in_ranges
 from torchrefract._validation import (
     check_color,
     check_flag,
@@ -41,12 +41,11 @@ from torchrefract.fields.depth import (
     ray_distance,
 )
 from torchrefract.fields.fog import blend_fog, extinction, transmission, unblend_fog
-from torchrefract.fields.srgb import color_per_channel
+from torchrefract.fields.srgb import color_of_images, color_per_channel
 from torchrefract.planning.photometric import (
     FogErrorModel,
     PhotometricPlan,
     PhotometricRequest,
-    in_ranges,
     plan_uniform_fog,
 )
 from torchrefract.types import Range
@@ -99,14 +98,10 @@ class FogMedium:
 
     def airlight_of(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the airlight for images (B, C, H, W) as (B, C)."""
-        batch, channels = image.shape[:2]
         if isinstance(self.airlight, str):
             return _AIRLIGHTS[self.airlight](to_batch(image)).to(dtype)
-        if self.airlight is None:
-            color = _PAPER_AIRLIGHT if channels == 3 else [_GRAY] * channels
-        else:
-            color = color_per_channel("airlight", self.airlight, channels)
-        return as_device_tensor([color] * batch, dtype=dtype, device=image.device).view(batch, channels)
+        paper = _PAPER_AIRLIGHT if image.shape[1] == 3 else (_GRAY,)
+        return color_of_images("airlight", paper if self.airlight is None else self.airlight, image, dtype)
 
     def distance(self, image: Tensor, depth: Tensor | None) -> Tensor:
         """Return how far light travels to each pixel of images (N, C, H, W), along the rays if the camera is known.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor, expand_batch
+from torchrefract._tensor import as_device_tensor, expand_batch, in_ranges
 from torchrefract._validation import (
     check_choice,
     check_number,
@@ -17,7 +17,7 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
+    eager_values,
     finite_or,
 )
 from torchrefract.cameras.camera import Camera, pinhole_of
@@ -43,7 +43,6 @@ from torchrefract.labels.vehicles import check_vehicle_labels
 from torchrefract.planning.photometric import (
     PhotometricPlan,
     PhotometricRequest,
-    in_ranges,
     plan_image_fog,
     plan_uniform_fog,
     plan_volumetric_fog,
@@ -354,7 +353,7 @@ class HeterogeneousFog(PhotometricEffect):
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
             k = self._extinction(expand_batch(k, rows), params, distance, image, plan)
         scale_height = params.scale_height if self.mode == "ray" else None
-        if scale_height is not None and eager_bool(lambda: scale_height.isinf().all(), of=k) is not True:
+        if scale_height is not None and eager_values(lambda: scale_height.isinf().all(), of=k) is not True:
             k = self._plume(scale_height, distance, image) * expand_batch(k, image.shape[0])
         if params.vehicles is not None and params.has_vehicles:
             k, mean = (expand_batch(value, image.shape[0]) for value in (k, mean))

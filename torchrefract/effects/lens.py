@@ -15,7 +15,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
     eager_values,
     requires_grad,
     warn,
@@ -133,9 +132,8 @@ class LensDistortion(WarpEffect):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         radial = (k1_range, k2_range, k3_range, k4_range, k5_range, k6_range)
         others = (p1_range, p2_range, s1_range, s2_range, s3_range, s4_range)
-        for name, value in zip(POLYNOMIAL12, radial + others, strict=True):
-            bounds = {"low": -_LARGEST_COEFFICIENT, "high": _LARGEST_COEFFICIENT}
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, **bounds))
+        bounds: dict[str, Range] = dict.fromkeys(POLYNOMIAL12, (-_LARGEST_COEFFICIENT, _LARGEST_COEFFICIENT))
+        self._set_ranges(dict(zip(POLYNOMIAL12, radial + others, strict=True)), bounds)
         self.focal_range = check_range("focal_range", focal_range, low=0.01, high=1000.0)
         self.aspect_range = check_range("aspect_range", aspect_range, low=0.01, high=100.0)
         self.center_x_range = check_range("center_x_range", center_x_range, low=-10.0, high=10.0)
@@ -257,7 +255,7 @@ class LensDistortion(WarpEffect):
         lens = lens_in_px(params, height, width)
         if plan.details is None:
             flow, exists = lens_flow(*lens, points)
-            if points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False:
+            if points.lattice.stride == 1 and eager_values(exists.all, of=exists) is False:
                 self._report_fold(params, exists, points)
         else:
             steps = plan.details.steps_for(points.lattice.stride)
@@ -290,7 +288,7 @@ class LensDistortion(WarpEffect):
             return effect
         fits = self._view(params, height, width)
         difference = torch.cat([(params.zoom - fits[0])[:, None], params.shift - fits[1]], dim=1).abs()
-        return effect.exact() if eager_bool((difference <= _SAME_VIEW).all, of=difference) is False else effect
+        return effect.exact() if eager_values((difference <= _SAME_VIEW).all, of=difference) is False else effect
 
     def cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
         """Return the camera of each degraded frame; see `clean_cameras` for that of its clean frame.
@@ -334,7 +332,7 @@ class LensDistortion(WarpEffect):
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         details = self._constant_plan(id(self), height, width, dtype).details
         with torch.set_grad_enabled(not is_fixed):
-            coefficients, focal, center = (value.double() for value in lens_in_px(params, height, width))
+            coefficients, focal, center = map(Tensor.double, lens_in_px(params, height, width))
             lens = coefficients, focal, center
 
             def position(points: Points) -> Tensor:
@@ -342,11 +340,11 @@ class LensDistortion(WarpEffect):
                 if details is not None and is_fixed:
                     # One more step than for the flow squares the error of its Newton steps.
                     steps = details.steps_for(1) + 1
-                    return pixels + newton_lens_flow(*lens, points, num_steps=steps, terms=used_terms(lens[0]))
+                    return pixels + newton_lens_flow(*lens, points, num_steps=steps, terms=used_terms(coefficients))
                 flow, exists = lens_flow(*lens, points)
                 return torch.where(exists, pixels + flow, torch.nan)
 
-            zoom, shift = zoom_to_fill(position, lens[2], height=height, width=width)
+            zoom, shift = zoom_to_fill(position, center, height=height, width=width)
         return zoom.to(dtype), (shift / width).to(dtype)
 
     def _ranges(self) -> LensRanges:

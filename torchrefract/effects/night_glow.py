@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_number, check_range, check_within, finite_or
+from torchrefract._validation import check_number, check_within, finite_or
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.exposure import is_unsaturated
@@ -89,15 +89,13 @@ class NightGlow(PhotometricEffect):
     ):
         super().__init__(tolerance=tolerance, p=p)
         ranges = {"optical_depth": optical_depth_range, "asymmetry": asymmetry_range, "luminance": luminance_range}
-        for name, value in ranges.items():
-            low, high = _LIMITS[name]
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=low, high=high))
+        self._set_ranges(ranges, _LIMITS)
         self.threshold = check_number("threshold", threshold, low=0.0, high=0.999)
         self.camera = check_camera(camera)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> NightGlowParams:
         """Draw all parameters uniformly in their ranges; frames with a sky of the day have lamps without light."""
-        applied, values = self.draw_in_ranges(stream, [getattr(self, f"{name}_range") for name in _LIMITS], image)
+        applied, values = self.draw_in_ranges(stream, [self._range(name) for name in _LIMITS], image)
         has_sky = find_sky(image).nodes.flatten(1).any(dim=1)
         return NightGlowParams(applied, values[:, 0], values[:, 1], torch.where(has_sky, 0.0, values[:, 2]))
 

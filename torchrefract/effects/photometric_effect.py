@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import assume_constant_result, expand_batch
-from torchrefract._validation import eager_bool, eager_values, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
@@ -18,7 +18,7 @@ from torchrefract.types import Degraded, Map
 from torchrefract.warping.grid import field_dtype
 
 # Values of the maps where nothing changes.
-_UNCHANGED = {"transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
+_UNCHANGED = {"valid": True, "transmission": 1.0, "extinction": 0.0, "intensity": 0.0}
 
 
 class Rendered(NamedTuple):
@@ -86,7 +86,7 @@ class PhotometricEffect(Effect):
 
     def for_params(self, params: Any, height: int, width: int) -> "PhotometricEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
-        if self.tolerance is None or eager_bool(lambda: self.params_in_range(params), of=params.applied) is not False:
+        if self.tolerance is None or eager_values(lambda: self.params_in_range(params), of=params.applied) is not False:
             return self
         return self.exact()
 
@@ -104,35 +104,39 @@ class PhotometricEffect(Effect):
         index = _active_samples(active, params)
         if index is not None:
             return self._degrade_samples(image, params, depth, index)
-        if eager_bool(active.any, of=active) is False:
+        if eager_values(active.any, of=active) is False:
             depth = None  # its values do not matter, so they are not checked either
         rendered = self.render(image, params, depth)
 
-        def masked_map(value: Map, unchanged: float | bool) -> Tensor:
+        def masked_map(name: str) -> Tensor:
+            value: Any = getattr(rendered, name)
             value = value() if callable(value) else value
-            if eager_bool(active.all, of=active) is not True:
+            if eager_values(active.all, of=active) is not True:
                 rows = max(value.shape[0], len(active))
+                unchanged = _UNCHANGED[name]
                 value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
             return value.expand(-1, 1, *image.shape[2:])
 
-        def lazy_map(name: str) -> Map:
-            return lambda: masked_map(getattr(rendered, name), _UNCHANGED[name])
-
         is_same = rendered.image is image
-        return Degraded(
-            image if is_same else where_active(rendered.image, image, active, params),
-            params,
-            valid=lambda: masked_map(rendered.valid, True),
-            light={name: lazy_map(name) for name in self.maps},
-        )
+        result = image if is_same else where_active(rendered.image, image, active, params)
+        return self._with_maps(result, params, masked_map)
+
+    def _with_maps(self, image: Tensor, params: Any, map_of: Callable[[str], Tensor]) -> Degraded:
+        """Build a result whose maps are computed from their names when they are first read."""
+
+        def lazy_map(name: str) -> Map:
+            return lambda: map_of(name)
+
+        light = {name: lazy_map(name) for name in self.maps}
+        return Degraded(image, params, valid=lazy_map("valid"), light=light)
 
     def _unchanged(self, image: Tensor, params: Any) -> Degraded:
-        def constant(value: float | bool, dtype: torch.dtype) -> Map:
-            shape = (image.shape[0], 1, *image.shape[2:])
-            return lambda: torch.full((), value, dtype=dtype, device=image.device).expand(shape)
+        def constant(name: str) -> Tensor:
+            dtype = torch.bool if name == "valid" else field_dtype(image.dtype)
+            value = torch.full((), _UNCHANGED[name], dtype=dtype, device=image.device)
+            return value.expand(image.shape[0], 1, *image.shape[2:])
 
-        light = {name: constant(_UNCHANGED[name], field_dtype(image.dtype)) for name in self.maps}
-        return Degraded(image, params, valid=constant(True, torch.bool), light=light)
+        return self._with_maps(image, params, constant)
 
     def _degrade_samples(self, image: Tensor, params: Any, depth: Tensor | None, index: Tensor) -> Degraded:
         """Degrade some samples of a batch, (n,), and leave the others."""
@@ -148,16 +152,8 @@ class PhotometricEffect(Effect):
                 others = value.new_full((batch * frames, *value.shape[1:]), others)
             return others.index_copy(0, rows_of_samples(index, frames), value)
 
-        def lazy_map(name: str) -> Map:
-            return lambda: with_others(getattr(degraded, name), _UNCHANGED[name])
-
-        is_same = degraded.image is part
-        return Degraded(
-            image if is_same else with_others(degraded.image, image),
-            params,
-            valid=lambda: with_others(degraded.valid, True),
-            light={name: lazy_map(name) for name in self.maps},
-        )
+        result = image if degraded.image is part else with_others(degraded.image, image)
+        return self._with_maps(result, params, lambda name: with_others(getattr(degraded, name), _UNCHANGED[name]))
 
     @assume_constant_result
     def _constant_plan(self, _: int, height: int, width: int, dtype: torch.dtype, has_depth: bool) -> PhotometricPlan:

@@ -4,26 +4,25 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import expand_batch
+from torchrefract._tensor import expand_batch, in_ranges
 from torchrefract._validation import (
     check_count,
     check_number,
     check_positive,
     check_range,
     check_within,
-    eager_bool,
+    eager_values,
     finite_or,
     requires_grad,
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
-from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
-from torchrefract.effects.random_field import check_frame
+from torchrefract.effects.random_field import check_frame, frames_of
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.physical_turbulence import (
@@ -237,9 +236,9 @@ class PhysicalTurbulence(WarpEffect):
     def _shift(self, params: PhysicalTurbulenceParams) -> Tensor | None:
         """Return (N, 2), m: how far the wind has moved the air, or None if it has not."""
         may_move = params.frame.shape[1] > 1 or requires_grad((params.frame, params.wind))
-        if not may_move and eager_bool((params.frame == 0).all, of=params.frame):
+        if not may_move and eager_values((params.frame == 0).all, of=params.frame):
             return None
-        frame = finite_or(params.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME).double().reshape(-1, 1)
+        frame = frames_of(params).double()[:, None]
         wind = expand_batch(finite_or(params.wind, 0.0).clamp(-_FASTEST, _FASTEST), len(frame))
         return frame / self.fps * wind.double()
 
@@ -265,7 +264,7 @@ class _TurbulenceBounds:
         """Return the largest displacement; each pixel has a ray of its own, so the flow is not smooth."""
         focal, _ = pinhole_of(self.camera, height=height, width=width, focal=self.focal)
         largest = _SIGMAS * self.gain * self.tilt[1] * 1e-6 * max(focal)
-        return FlowBounds(largest, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(largest)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave nothing out."""
@@ -276,8 +275,7 @@ class _TurbulenceBounds:
 
     def contains(self, params: PhysicalTurbulenceParams) -> Tensor:
         """Return (), bool: the tilt lies in the range, up to rounding."""
-        low, high = self.tilt
-        return ((params.tilt >= low * (1 - 1e-5)) & (params.tilt <= high * (1 + 1e-5))).all()
+        return in_ranges(params.tilt[:, None], [self.tilt])
 
 
 def road_depth(camera: Camera | None, *, focal: float, height: float | None, horizon: float) -> GroundPlaneDepth:

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import eager_bool
+from torchrefract._validation import eager_values
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import per_sample
 from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
@@ -31,11 +31,11 @@ _COMBINE: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 class Leaf(NamedTuple):
-    """An effect that is not a composition, with the sampling options of the compositions around it."""
+    """An effect of a composition, with what it needs."""
 
-    effect: Effect
-    options: SamplingOptions
-    params: Any = None
+    effect: Any  # a `WarpEffect` or a `PhotometricEffect`
+    params: Any
+    options: SamplingOptions  # first those of the compositions around it
 
 
 class _Segment(NamedTuple):
@@ -116,9 +116,8 @@ class Progress:
         self._frame = self.image = mean_of_exposures(self.image, len(segments), sampled, segment.active, applied)
         self.light = {name: _moved(value, segment) for name, value in self.light.items()}
         for leaf, moves in zip(leaves, active, strict=True):
-            warp = cast(WarpEffect, leaf.effect)
-            flow = _remember(partial(warp.planned_flow, leaf.params, height, width, share_px))
-            self.warps.append((warp, leaf.params, flow, moves))
+            flow = _remember(partial(leaf.effect.planned_flow, leaf.params, height, width, share_px))
+            self.warps.append((leaf.effect, leaf.params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
         self.segments.append(segment)
 
@@ -145,27 +144,17 @@ class Progress:
         """Apply a photometric effect."""
         depth = self.depth_for(effect) if effect.may_change(params) else self.depth
         shaded = effect.degrade_batch(self.image, params, depth)
-        rows, before, valid = self.image.shape[0], dict(self.light), self.valid
+        rows, light = self.image.shape[0], dict(self.light)
         self.image = shaded.image
-        self.valid = (
-            (lambda: expand_batch(shaded.valid, rows))
-            if valid is None
-            else (lambda: valid() & expand_batch(shaded.valid, rows))
-        )
 
-        def own_map(name: str) -> Callable[[], Tensor] | None:
-            return (lambda: expand_batch(getattr(shaded, name), rows)) if shaded.has(name) else None
+        def each_frame(name: str) -> Callable[[], Tensor]:
+            return lambda: expand_batch(getattr(shaded, name), rows)
 
-        transmission = own_map("transmission")
-        if "intensity" in before and transmission is not None:  # light that was added before is attenuated
-            added = before["intensity"]
-            before["intensity"] = lambda: added() * transmission()
-        self.light = before
-        for name, combine in _COMBINE.items():
-            value = own_map(name)
-            if value is not None:
-                earlier = self.light.get(name)
-                self.light[name] = value if earlier is None else _combined(combine, earlier, value)
+        self.valid = _combined(torch.logical_and, self.valid, each_frame("valid"))
+        maps = {name: each_frame(name) for name in _COMBINE if shaded.has(name)}
+        if "intensity" in light and "transmission" in maps:  # light that was added before is attenuated
+            light["intensity"] = _combined(torch.mul, light["intensity"], maps["transmission"])
+        self.light = light | {name: _combined(_COMBINE[name], light.get(name), value) for name, value in maps.items()}
 
     def result(self, params: Any) -> Degraded:
         """Return the images with all maps."""
@@ -194,11 +183,7 @@ class Progress:
             return torch.zeros(rows, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
         flow = self.segments[-1].flow.dense
         for segment in reversed(self.segments[:-1]):
-            flow = torch.where(
-                per_sample(segment.active),
-                compose_flows(segment.flow.dense, flow),
-                flow,
-            )
+            flow = torch.where(per_sample(segment.active), compose_flows(segment.flow.dense, flow), flow)
         return flow
 
     def _is_composed(self) -> Tensor:
@@ -216,7 +201,7 @@ class Progress:
                 total, valid, moved = inverse, exists, moves
                 continue
             both, alone = per_sample(moved & moves), per_sample(moves)
-            if eager_bool(both.any, of=both) is not False:
+            if eager_values(both.any, of=both) is not False:
                 exists = torch.where(both, valid & sees_only_valid(exists, total), exists)
                 inverse = torch.where(both, compose_flows(inverse, total), inverse)
             total, valid = torch.where(alone, inverse, total), torch.where(alone, exists, valid)
@@ -257,9 +242,10 @@ def _moved(value: Callable[[], Tensor], segment: _Segment) -> Callable[[], Tenso
 
 
 def _combined(
-    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor], second: Callable[[], Tensor]
+    combine: Callable[[Tensor, Tensor], Tensor], first: Callable[[], Tensor] | None, second: Callable[[], Tensor]
 ) -> Callable[[], Tensor]:
-    return lambda: combine(first(), second())
+    """Return a map that combines two; the second one if there is no first."""
+    return second if first is None else lambda: combine(first(), second())
 
 
 def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], active: Sequence[Tensor]) -> Tensor:
@@ -268,7 +254,7 @@ def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], ac
     decided = active[-1]
     for leaf, moves in zip(reversed(leaves[:-1]), reversed(active[:-1]), strict=True):
         chosen = moves & ~decided
-        if leaf.options != leaves[-1].options and eager_bool(chosen.any, of=chosen) is not False:
+        if leaf.options != leaves[-1].options and eager_values(chosen.any, of=chosen) is not False:
             result = torch.where(per_sample(chosen), segment.sample(image, leaf.options), result)
         decided = decided | moves
     return result

@@ -10,7 +10,6 @@ from torchrefract._validation import (
     check_range,
     check_values,
     check_within,
-    eager_bool,
     eager_values,
     finite_or,
     requires_grad,
@@ -65,6 +64,11 @@ def check_frame(params: Any) -> None:
     check_within("params.frame", params.frame, -LATEST_FRAME, LATEST_FRAME)
 
 
+def frames_of(params: Any) -> Tensor:
+    """Return (B T,), the numbers of the frames, within the bounds of `check_frame`; a NaN counts as frame 0."""
+    return finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
+
+
 def check_field_range(name: str, value: Range) -> Range:
     """Check the range of one of `FIELD_BOUNDS`."""
     low, high = FIELD_BOUNDS[name]
@@ -85,7 +89,7 @@ def motion_of(params: Any) -> Motion:
     rows = params.frame.numel()
     wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
     return Motion(
-        finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME),
+        frames_of(params),
         finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
         torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf),
     )
@@ -104,7 +108,7 @@ def _is_still(params: Any) -> bool:
     moving = (params.frame, params.wind, params.decorrelation)
     if params.frame.shape[1] > 1 or requires_grad(moving):
         return False
-    return eager_bool((params.frame == 0).all, of=params.frame) is True
+    return eager_values((params.frame == 0).all, of=params.frame) is True
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import check_choice, check_within, eager_bool, warn
+from torchrefract._validation import check_choice, check_within, eager_values, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.lens import check_lens, lens_in_px
@@ -142,8 +142,8 @@ class Rectification(WarpEffect):
             is_missing = is_border_missing(*camera, model=self.model, height=height, width=width)
             return (params.applied & is_missing).any()
 
-        is_suspect = points.lattice.stride == 1 and eager_bool(exists.all, of=exists) is False
-        if is_suspect and eager_bool(folds, of=params.applied):
+        is_suspect = points.lattice.stride == 1 and eager_values(exists.all, of=exists) is False
+        if is_suspect and eager_values(folds, of=params.applied):
             warn("camera: the model folds back inside the frame: pixels beyond are padded, not valid")
         return flow, exists
 
@@ -170,7 +170,7 @@ class Rectification(WarpEffect):
         effect, zoom = super().for_params(params, height, width), params.zoom
         if zoom is None or self.tolerance_px is None:
             return effect
-        is_same = eager_bool(((zoom - self._zoom(params, height, width)).abs() <= 1e-3).all, of=zoom)
+        is_same = eager_values(((zoom - self._zoom(params, height, width)).abs() <= 1e-3).all, of=zoom)
         return effect.exact() if is_same is False else effect
 
     def clean_camera(self, height: int, width: int) -> Camera:

@@ -4,25 +4,24 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract import random
+from torchrefract._tensor import in_ranges
 from torchrefract._validation import (
     check_count,
     check_number,
     check_positive,
-    check_range,
     check_within,
     eager_values,
     finite_or,
     requires_grad,
 )
-from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
-from torchrefract.effects.random_field import check_frame
+from torchrefract.effects.random_field import check_frame, frames_of
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.road_mirage import (
@@ -129,9 +128,8 @@ class RoadMirage(WarpEffect):
         p: float = 1.0,
     ):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
-        given = (difference_range, shimmer_range, wave_range, rate_range)
-        for (name, (low, high)), value in zip(_BOUNDS.items(), given, strict=False):
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=low, high=high))
+        ranges = {"difference": difference_range, "shimmer": shimmer_range, "wave": wave_range, "rate": rate_range}
+        self._set_ranges(ranges, _BOUNDS)
         self.num_waves = check_count("num_waves", num_waves)
         self.fps = check_number("fps", fps, low=1e-3, high=1e6)
         self.camera_height = check_number("camera_height", camera_height, low=1e-3, high=1e6)
@@ -163,7 +161,6 @@ class RoadMirage(WarpEffect):
         """Compute the flow at points; it exists everywhere."""
         mirage: RoadMirageParams = params.params
         values = {name: finite_or(getattr(mirage, name), 0.0).clamp(*ends) for name, ends in _BOUNDS.items()}
-        frame = finite_or(mirage.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
         below = points.y - (self.horizon * plan.height - 0.5)
         focal = self.focal * plan.width
         inverse_depth = sample_at(1 / params.depth.detach().to(below.dtype).clamp(min=1e-6), points)
@@ -173,7 +170,7 @@ class RoadMirage(WarpEffect):
             rows = _rows_between(below, focal * critical_angle(hottest).amax() + _FADED_PX)
         below, x, inverse_depth = (v[:, :, rows] if v.shape[2] > 1 else v for v in (below, points.x, inverse_depth))
         place = (x + 0.5) / plan.width
-        difference = shimmering_difference(**values, place=place, time=frame.double().reshape(-1) / self.fps)
+        difference = shimmering_difference(**values, place=place, time=frames_of(mirage).double() / self.fps)
         # 1 / distance of the ground, 1/m; that of a depth map may be 0 in the sky.
         ground = below.clamp(min=0) / (focal * self.camera_height)
         lateral = (place - self.vanishing).abs() * plan.width / focal  # m, at a distance of 1 m
@@ -192,9 +189,6 @@ class RoadMirage(WarpEffect):
         difference, shimmer = self._range("difference"), self._range("shimmer")
         hottest = difference[1] * (1 + shimmer[1] * math.sqrt(2 * self.num_waves))
         return _MirageBounds(difference, shimmer, self.focal * math.sqrt(2 * REFRACTIVITY / AIR_TEMPERATURE * hottest))
-
-    def _range(self, name: str) -> Range:
-        return getattr(self, f"{name}_range")
 
 
 def _rows_between(below: Tensor, lowest: Tensor) -> slice:
@@ -223,7 +217,7 @@ class _MirageBounds:
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return the largest displacement and slope; the edge is too sharp for a lattice."""
         largest = self.height * width
-        return FlowBounds(2 * largest, 2 + 2 * largest * _STEEPEST, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(2 * largest, 2 + 2 * largest * _STEEPEST)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave nothing out."""
@@ -231,8 +225,4 @@ class _MirageBounds:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: difference and shimmer lie in the ranges, up to rounding."""
-        inside = torch.ones((), dtype=torch.bool, device=params.applied.device)
-        for name in ("difference", "shimmer"):
-            value, (low, high) = getattr(params, name), getattr(self, name)
-            inside = inside & ((value >= low * (1 - 1e-5)) & (value <= high * (1 + 1e-5))).all()
-        return inside
+        return in_ranges(torch.stack([params.difference, params.shimmer], dim=1), [self.difference, self.shimmer])

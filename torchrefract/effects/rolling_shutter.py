@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number, check_range, check_values, check_within, finite_or
+from torchrefract._validation import check_count, check_number, check_values, check_within, finite_or
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
-from torchrefract.effects.batch import LATEST_FRAME, ParamsAtDepth, check_shapes, params_to
-from torchrefract.effects.random_field import check_frame
+from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
+from torchrefract.effects.random_field import check_frame, frames_of
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.rolling_shutter import (
@@ -129,8 +129,7 @@ class RollingShutter(WarpEffect):
     ):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         given = (speed_range, readout_range, exposure_range, pitch_range, yaw_range, roll_range, frequency_range)
-        for (name, (low, high)), value in zip(_BOUNDS.items(), given, strict=True):
-            setattr(self, f"{name}_range", check_range(f"{name}_range", value, low=low, high=high))
+        self._set_ranges(dict(zip(_BOUNDS, given, strict=True)), _BOUNDS)
         self.num_frequencies = check_count("num_frequencies", num_frequencies)
         self.num_exposures = check_count("num_exposures", num_exposures)
         self.fps = check_number("fps", fps, low=1e-3, high=1e6)
@@ -201,9 +200,6 @@ class RollingShutter(WarpEffect):
         count = self.num_exposures if self._range("exposure")[1] > 0 else 1
         return [(k + 0.5) / count - 0.5 for k in range(count)]
 
-    def _range(self, name: str) -> Range:
-        return getattr(self, f"{name}_range")
-
     def _motion(self, at_depth: ParamsAtDepth) -> tuple[ShutterMotion, Tensor]:
         """Return the motion of each frame in SI units, and 1 / depth; values that are not finite move nothing."""
         params: Any
@@ -215,9 +211,8 @@ class RollingShutter(WarpEffect):
             return finite_or(value, 0.0).clamp(-largest, largest)
 
         frequency = bounded("frequency", params.frequency)
-        frame = finite_or(params.frame, 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
         # Late frames have large phases, of which float32 would lose the digits.
-        turns = frequency.double() * (frame.double() / self.fps)
+        turns = frequency.double() * (frames_of(params).double()[:, None] / self.fps)
         phase = (
             finite_or(params.phase, 0.0) + 2 * math.pi * (turns - turns.detach().floor()).to(frequency.dtype)[:, None]
         )

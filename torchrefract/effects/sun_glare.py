@@ -37,7 +37,7 @@ from torchrefract.fields.exposure import (
     metered_nodes,
 )
 from torchrefract.fields.sky import find_sky, sky_point
-from torchrefract.fields.srgb import color_per_channel, linear_to_srgb, srgb_to_linear
+from torchrefract.fields.srgb import color_of_images, linear_to_srgb, srgb_to_linear
 from torchrefract.fields.sun import Sun, sun_light
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -176,7 +176,7 @@ class SunGlare(PhotometricEffect):
         """Draw all parameters uniformly in their ranges, and the place of the sun in the sky of the frame."""
         places = [self.center_x_range or (0.0, 1.0), self.center_y_range or _ABOVE]
         names = ("luminance", "scatter", "scale", "shape", "gamma", "time_constant", "drift_x", "drift_y")
-        ranges = [*places, *(getattr(self, f"{name}_range") for name in names)]
+        ranges = [*places, *(self._range(name) for name in names)]
         applied, values = self.draw_in_ranges(stream, ranges, image)
         center, luminance = values[:, :2], values[:, 2]
         inner = random.fold(stream)
@@ -191,8 +191,7 @@ class SunGlare(PhotometricEffect):
         spans = [_GHOST_PLACES, self.ghost_radius_range, self.ghost_share_range, *[_TINTS] * channels]
         ghosts = random.uniform_in_ranges(inner.at(1), spans * self.num_ghosts, dtype=values.dtype)
         ghosts = ghosts.view(batch, self.num_ghosts, 3 + channels)
-        colors = [color_per_channel("color", self.color, channels)] * batch
-        color = as_device_tensor(colors, dtype=values.dtype, device=values.device).view(batch, channels)
+        color = color_of_images("color", self.color, image, values.dtype)
         _, _, _, scatter, scale, shape, gamma, time_constant = values[:, :8].unbind(1)
         return SunGlareParams(
             applied,

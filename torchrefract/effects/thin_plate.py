@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_range, check_values, eager_bool
+from torchrefract._validation import check_count, check_range, check_values, eager_values
 from torchrefract.effects.batch import params_to
 from torchrefract.effects.batch_flow import everywhere
 from torchrefract.effects.warp_effect import WarpEffect
@@ -123,7 +123,7 @@ class ThinPlateSpline(WarpEffect):
         def are_drawn() -> Tensor:
             return ((params.points - self._points(height, width, params.points)).abs() <= _CLOSE).all()
 
-        if self.tolerance_px is not None and eager_bool(are_drawn, of=params.points) is False:
+        if self.tolerance_px is not None and eager_values(are_drawn, of=params.points) is False:
             return self.exact()
         return super().for_params(params, height, width)
 

@@ -1,15 +1,13 @@
 """Turbulent air in front of the camera."""
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_choice, check_positive, eager_bool, warn
+from torchrefract._validation import check_choice, check_positive, eager_values, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import ParamsAtDepth, params_to
 from torchrefract.effects.batch_flow import everywhere
@@ -273,7 +271,7 @@ class Turbulence(WarpEffect):
             gradient = gradient_rms(params.length, kind=self.covariance, aperture=params.aperture)
             return (params.applied & (params.amplitude * gradient > _FOLDING_GRADIENT)).any()
 
-        if eager_bool(folds, of=params.applied):
+        if eager_values(folds, of=params.applied):
             warn(
                 "Turbulence this strong folds the image; folded pixels are excluded from restore_valid. Lower "
                 "amplitude_range, or raise length_range or aperture_range."
@@ -293,8 +291,7 @@ class _AtDepthErrorModel:
 
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return the largest displacement; depth has edges, so the flow is not smooth."""
-        largest = self.field.bounds(height, width).max_displacement
-        return FlowBounds(largest, math.inf, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(self.field.bounds(height, width).max_displacement)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Interpolate the field, and compute its share at every pixel."""

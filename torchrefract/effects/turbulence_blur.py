@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import assume_constant_result, expand_batch
-from torchrefract._validation import check_number, check_range, check_within, eager_bool, finite_or, requires_grad
+from torchrefract._tensor import assume_constant_result, expand_batch, in_ranges
+from torchrefract._validation import check_number, check_range, check_within, eager_values, finite_or, requires_grad
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to, per_sample
 from torchrefract.effects.compose import Compose, ComposeParams
@@ -26,7 +26,7 @@ from torchrefract.fields.turbulence_blur import (
     halo_px,
     largest_change,
 )
-from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, in_ranges, plan_turbulence_blur
+from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, plan_turbulence_blur
 from torchrefract.types import Range
 
 TOLERANCE = 0.5  # levels
@@ -156,7 +156,7 @@ class TurbulenceBlur(PhotometricEffect):
 
     def for_params(self, params: TurbulenceBlurParams, height: int, width: int) -> "TurbulenceBlur":
         """Return this effect, or an exact one for stronger air if parameters lie outside the range."""
-        if eager_bool(lambda: self.params_in_range(params), of=params.applied) is not False:
+        if eager_values(lambda: self.params_in_range(params), of=params.applied) is not False:
             return self
         effect = cast(TurbulenceBlur, self.exact())
         effect._highest_ratio = 10.0 ** math.ceil(math.log10(params.ratio.max().item()))

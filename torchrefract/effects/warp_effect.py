@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import assume_constant_result, expand_batch, to_float
-from torchrefract._validation import check_choice, eager_bool, requires_grad
+from torchrefract._validation import check_choice, eager_values, requires_grad
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
 from torchrefract.effects.batch_flow import (
@@ -152,7 +152,7 @@ class WarpEffect(Effect):
     def for_params(self, params: Any, height: int, width: int) -> "WarpEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
         model = self.error_model() if self.tolerance_px is not None else None
-        if model is None or eager_bool(lambda: model.contains(params), of=params.applied) is not False:
+        if model is None or eager_values(lambda: model.contains(params), of=params.applied) is not False:
             return self
         return self.exact()
 
@@ -228,10 +228,7 @@ class WarpEffect(Effect):
         if flow.is_zero and len(moments) == 1:
             return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
-        moves, options = (
-            expand_batch(active, len(image)),
-            SamplingOptions(self.padding, self.interpolation, self.backend),
-        )
+        moves, options = expand_batch(active, len(image)), SamplingOptions().or_else(self)
 
         def sampled(source: Tensor, k: int) -> Tensor:
             along = flow if len(moments) == 1 else self.flow_by_plan(params.at(moments[k]), height, width)
@@ -301,7 +298,7 @@ def warped(
     def restore_valid(result: Degraded, exists: Tensor) -> Tensor:
         good = exists & sees_only_valid(*_expand_alike(result.valid, result.restore_flow))
         composed = None if is_composed is None else is_composed()
-        if composed is None or eager_bool(composed.any, of=composed) is False:
+        if composed is None or eager_values(composed.any, of=composed) is False:
             return good
         is_once = is_shown_once(*_expand_alike(result.flow, result.restore_flow, exists, result.valid))
         is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_once

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._validation import requires_grad
+from torchrefract.warping.grid import pixel_axes
 
 _MIN_RADIUS = 1e-6  # px
 
@@ -22,8 +23,7 @@ def flare_axes(center: Tensor, radius: Tensor, *, height: int, width: int) -> tu
     Returns:
         (B, 1, 1, W) along x and (B, 1, H, 1) along y; their product is m.
     """
-    x = torch.arange(width, dtype=center.dtype, device=center.device).view(1, 1, 1, width)
-    y = torch.arange(height, dtype=center.dtype, device=center.device).view(1, 1, height, 1)
+    x, y = pixel_axes(height, width, dtype=center.dtype, device=center.device)
     cx, cy = center.view(-1, 2, 1, 1, 1).unbind(1)
     # The square of the distance has a gradient at the center, the distance has none.
     divisor = -2 * radius.clamp(min=_MIN_RADIUS).square().view(-1, 1, 1, 1)

@@ -17,6 +17,7 @@ from torchrefract._validation import finite_or
 from torchrefract.fields.perlin import fade_out
 from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
+from torchrefract.warping.flow import keys_cubic
 
 # Variance of the noise over all gradients and places in a cell. Each of the 8 nodes adds a third of the mean of
 # (h(p) h(q) h(r))^2 (p^2 + q^2 + r^2); the mean of h^2 is 181 / 462, that of (h p)^2 is 535 / 18018.
@@ -328,9 +329,8 @@ def _quadrature(like: Tensor) -> Tensor:
 def _cubic_weights(cells: int, like: Tensor) -> Tensor:
     """(finer cells + 1, cells + 3): from rays to a finer lattice, by Keys' cubic of a = -1/2."""
     fine = torch.arange(cells * _FINER + 1, dtype=torch.float64, device=like.device) / _FINER
-    x = (fine[:, None] + 1 - torch.arange(cells + 3, dtype=torch.float64, device=like.device)).abs()
-    near, far = (1.5 * x - 2.5) * x * x + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
-    return torch.where(x < 1, near, torch.where(x < 2, far, 0)).to(like.dtype)
+    rays = torch.arange(cells + 3, dtype=torch.float64, device=like.device)
+    return keys_cubic(fine[:, None] + 1 - rays).to(like.dtype)
 
 
 def _slice_of(distance: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.cameras.brown_conrady import (
     Point,
     Terms,
@@ -152,7 +152,7 @@ def _distortion_error(
 
 
 def _to_flow(u: Tensor, v: Tensor, exists: Tensor, x: Tensor, y: Tensor, focal: Tensor) -> Tensor:
-    if not eager_bool(exists.all, of=exists):
+    if not eager_values(exists.all, of=exists):
         # Points without a solution are sampled outward past every frame: padded, never extrapolated.
         u, v = torch.where(exists, u, 2 * REACH * x.detach()), torch.where(exists, v, 2 * REACH * y.detach())
     return torch.cat([u, v], dim=1) * focal[:, :, None, None]

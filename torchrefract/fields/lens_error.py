@@ -72,11 +72,6 @@ class LensRanges(NamedTuple):
     center_x: Range
     center_y: Range
 
-    @classmethod
-    def from_numbers(cls, numbers: Sequence[Range]) -> "LensRanges":
-        """Build from the ranges of all 16 numbers."""
-        return cls(tuple(numbers[:-4]), *numbers[-4:])
-
     @property
     def numbers(self) -> tuple[Range, ...]:
         """Return the ranges of all 16 numbers."""
@@ -93,11 +88,6 @@ class LensDetails(NamedTuple):
         """Return the number of Newton steps for the nodes of a lattice."""
         finer = [level for level in _LEVEL_STRIDES if level < stride]
         return self.num_steps[min(len(finer), len(self.num_steps) - 1)]
-
-
-def lens_numbers(coefficients: Tensor, focal: Tensor, center: Tensor) -> Tensor:
-    """Return (B, 16), the numbers in the order of `LensRanges`, from (B, 12), (B, 2) and (B, 2)."""
-    return torch.cat([coefficients, focal[:, :1], focal[:, 1:] / focal[:, :1], center], dim=1)
 
 
 @dataclass(frozen=True)
@@ -140,7 +130,8 @@ class LensErrorModel:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: each lens lies in one of the boxes, up to rounding."""
-        numbers = lens_numbers(params.coefficients, params.focal, params.center)
+        focal, aspect = params.focal[:, :1], params.focal[:, 1:] / params.focal[:, :1]
+        numbers = torch.cat([params.coefficients, focal, aspect, params.center], dim=1)
         boxes = as_device_tensor([box.numbers for box in self.boxes], dtype=numbers.dtype, device=numbers.device)
         low, high = boxes.unbind(2)
         margin = 1e-5 * torch.maximum(low.abs(), high.abs())

@@ -52,9 +52,8 @@ class LensSource(NamedTuple):
     def boxes(self) -> tuple[LensRanges, ...]:
         """Return for each lens the ranges of its numbers."""
         reach = [sum(map(abs, row)) for row in self.spread] or [0.0] * 16
-        return tuple(
-            LensRanges.from_numbers([(n - r, n + r) for n, r in zip(lens, reach, strict=True)]) for lens in self.lenses
-        )
+        spans = [[(n - r, n + r) for n, r in zip(lens, reach, strict=True)] for lens in self.lenses]
+        return tuple(LensRanges(tuple(span[:-4]), *span[-4:]) for span in spans)
 
     @property
     def ranges(self) -> dict[str, Range]:

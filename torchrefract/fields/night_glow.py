@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import exact_matmul, interpolate_channels, rows_at_once, without_autocast
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.fields.exposure import finite_image
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
@@ -50,7 +50,7 @@ def lamp_light(image: Tensor, threshold: float) -> Tensor:
         count = rows_at_once(image.device, height, each=each, cached=_CACHED_VALUES, shared=True)
         count = max(stride, count // stride * stride)
         light = torch.cat([of_rows(image[:, :, start : start + count]) for start in range(0, height, count)], dim=2)
-        if eager_bool(lambda: light.isfinite().all(), of=light) is False:
+        if eager_values(lambda: light.isfinite().all(), of=light) is False:
             light = of_rows(finite_image(image))
     return (light / (1 - threshold) ** 2).clamp(max=1.0)
 

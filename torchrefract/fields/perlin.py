@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import exact_matmul, without_autocast
-from torchrefract._validation import eager_bool, requires_grad
+from torchrefract._validation import eager_values, requires_grad
 from torchrefract.fields.random_field import Motion
 from torchrefract.random import lattice_noise
 
@@ -169,7 +169,7 @@ def _blocks(position: Tensor, nodes: int, step: float, dtype: torch.dtype) -> tu
 def _turns(key: Tensor, nodes: Sequence[Tensor], motion: Motion, dtype: torch.dtype) -> Tensor:
     """Compute (N, n, m): the angles of the gradients over 2 pi."""
     frame, decorrelation = motion.frame, motion.decorrelation
-    if not requires_grad((frame, decorrelation)) and eager_bool((frame / decorrelation == 0).all, of=frame):
+    if not requires_grad((frame, decorrelation)) and eager_values((frame / decorrelation == 0).all, of=frame):
         return lattice_noise(key, nodes, 1)[:, 0, 0].to(dtype)
     start, speed = lattice_noise(key, nodes, 2)[:, :, 0].unbind(1)
     elapsed = (frame.double() / (math.pi * decorrelation.double()))[:, None, None]

@@ -25,9 +25,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cached, exact_matmul, shareable
+from torchrefract._tensor import as_device_tensor, cached_constant, exact_matmul, shareable
 from torchrefract._validation import why_not_eager
-from torchrefract.fields.random_field import fast_size, periodic_part
+from torchrefract.fields.random_field import fast_size, periodic_part, turn_waves
 from torchrefract.random import white_noise
 
 GREEN = 550e-9  # m, wavelength of the light that counts most
@@ -203,7 +203,7 @@ def _layer_gradient(
     height, half = size[0], size[1] // 2 + 1
     count = height * half
     noise = white_noise(key, count, start=k * count).to(dtype).unflatten(2, (height, half))
-    # A FakeTensor cannot be mixed with cached values.
+    # A FakeTensor cannot be mixed with cached values, which must not be written to.
     amplitudes = _cached_amplitudes if why_not_eager(key) is None else _amplitudes
     amplitude, uniform = amplitudes(layers, k, focal, size, dtype, key.device)
     values = noise * amplitude
@@ -344,7 +344,7 @@ def _amplitudes(
     return amplitude.to(dtype), uniform.to(dtype)
 
 
-_cached_amplitudes = cached(_amplitudes)
+_cached_amplitudes = cached_constant(maxsize=16)(_amplitudes)
 
 
 def _moved(values: Tensor, angle: Tensor, focal: tuple[float, float], size: tuple[int, int]) -> Tensor:
@@ -353,9 +353,7 @@ def _moved(values: Tensor, angle: Tensor, focal: tuple[float, float], size: tupl
     # Whole turns are subtracted in float64, so that late frames are as exact as the first.
     phase_x, phase_y = angle[:, 0, None, None].double() * qx, angle[:, 1, None, None].double() * qy
     phase = (phase_x + phase_y).remainder(2 * math.pi).to(values.dtype)
-    cos, sin = phase.cos(), phase.sin()
-    real, imaginary = values.unbind(1)
-    return torch.stack([real * cos + imaginary * sin, imaginary * cos - real * sin], dim=1)
+    return turn_waves(values, -phase)
 
 
 def _gradient(

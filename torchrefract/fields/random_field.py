@@ -203,15 +203,9 @@ def amplitudes(
     if kind != "exponential":  # eigenvalues below rounding would have roots with arbitrary gradients
         values = torch.where(values.abs() > _ROUNDING * values.amax(dim=(1, 2), keepdim=True), values, 0)
     positive = values.clamp(min=0)
-    # torch.compile cannot iterate over what a property of a constant returns.
-    axes = ((frequencies.size[0], frequencies.rows), (frequencies.size[1], frequencies.columns))
-    smooth_y, smooth_x = (
-        _smoothing(torch.arange(highest + 1, dtype=torch.float64, device=values.device) / n, aperture)
-        for n, highest in axes
-    )
-    count_y, count_x = (_multiplicity(highest + 1, values.device, has_middle=2 * highest >= n) for n, highest in axes)
-    smooth_y, smooth_x = smooth_y[..., None], smooth_x[..., None, :]
-    weight_y, weight_x = count_y[:, None] * smooth_y.square(), count_x * smooth_x.square()
+    smooth_x, weight_x = _axis_factors(frequencies.size[1], frequencies.columns, aperture, values.device)
+    smooth_y, weight_y = _axis_factors(frequencies.size[0], frequencies.rows, aperture, values.device)
+    smooth_y, weight_y = smooth_y.mT, weight_y.mT
 
     def total(eigenvalues: Tensor) -> Tensor:
         return ((eigenvalues * weight_x).sum(dim=2, keepdim=True) * weight_y).sum(dim=1, keepdim=True)
@@ -359,8 +353,13 @@ def _evolve(noise: Tensor, rates: Tensor, frequencies: Frequencies, motion: Moti
     angles = shift[:, :1] * kx, shift[:, 1:].mT * ky[:, None]
     drift = sum(angle.remainder(2 * math.pi).to(noise.dtype) for angle in angles)
     phase = (math.sqrt(2) * motion.frame / motion.decorrelation)[:, None, None].to(noise.dtype) * rates + drift
+    return turn_waves(noise, phase)
+
+
+def turn_waves(values: Tensor, phase: Tensor) -> Tensor:
+    """Multiply waves (N, 2, Ky, Kx), real and imaginary part, by exp(i phase), (N, Ky, Kx)."""
     cos, sin = phase.cos(), phase.sin()
-    real, imaginary = noise.unbind(1)
+    real, imaginary = values.unbind(1)
     return torch.stack([real * cos - imaginary * sin, real * sin + imaginary * cos], dim=1)
 
 
@@ -385,13 +384,21 @@ def _indices(frequencies: Frequencies, device: torch.device) -> Tensor:
     return (ky[:, None].remainder(height) * width + kx.remainder(width)).flatten()
 
 
-def _smoothing(frequency: Tensor, aperture: Tensor | None) -> Tensor:
-    """Compute the factor of a Gaussian aperture, (N, K) or (K,), at frequencies (K,) in cycles per px."""
+def _axis_factors(size: int, highest: int, aperture: Tensor | None, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Compute the factors of a Gaussian aperture at frequencies from 0 to the highest one along an axis of a domain.
+
+    Returns:
+        factor: (N or 1, 1, highest + 1).
+        weight: (N or 1, 1, highest + 1), the squared factor, as often as the frequency occurs in the domain.
+    """
+    frequency = torch.arange(highest + 1, dtype=torch.float64, device=device) / size
     if aperture is None:
-        return torch.ones_like(frequency)
-    factor = torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None] * frequency).square())
-    # Arithmetic with denormal products of smaller factors is many times slower.
-    return torch.where(factor > _NEGLIGIBLE, factor, 0)
+        factor = torch.ones_like(frequency)[None, None]
+    else:
+        factor = torch.exp(-0.5 * (2 * math.pi * aperture.double()[:, None, None] * frequency).square())
+        # Arithmetic with denormal products of smaller factors is many times slower.
+        factor = torch.where(factor > _NEGLIGIBLE, factor, 0)
+    return factor, _multiplicity(highest + 1, device, has_middle=2 * highest >= size) * factor.square()
 
 
 def _multiplicity(count: int, device: torch.device, *, has_middle: bool) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import highest_nearby
-from torchrefract._validation import eager_bool
+from torchrefract._validation import eager_values
 from torchrefract.cameras.camera import Pinhole
 from torchrefract.warping.grid import Points, pixel_axes
 from torchrefract.warping.implicit import sample_at
@@ -165,7 +165,7 @@ def rolling_shutter_flow(
     exists = is_ahead & (scale > _SMALLEST_SCALE)
     end = at(scale)
     flow = torch.cat(torch.broadcast_tensors(end.x - points.x, end.y - points.y), dim=1)
-    if eager_bool(exists.all, of=exists) is not True:
+    if eager_values(exists.all, of=exists) is not True:
         flow = torch.where(exists, flow, _OUTSIDE * max(height, width))
     return flow, exists
 

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import in_ranges
 from torchrefract.cameras.camera import Camera, pinhole_of
 from torchrefract.fields.depth import DepthProvider, DepthSource
 from torchrefract.types import FlowBounds, Range, Simplification
+from torchrefract.warping.lattice import lagrange_basis
 
 _SAFETY = 1.25  # of measured errors, since the flow is not quite linear along rows
 _LARGEST_SHARE = 0.4  # of a depth, driven while the rows are read
@@ -21,7 +22,6 @@ _FOURTH = 9 / 16 / 24  # times the fourth derivative and stride^4: error of cubi
 _OFFSETS = 4  # of the lattice, at which errors are measured
 _LARGEST_STRIDE = 128  # px
 _SMALLEST_FRAME = 1 << 14  # pixels
-_ROUNDING = 1e-5  # relative, of drawn values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +77,7 @@ class RollingShutterErrorModel:
             values = values[:, None] if values.ndim == 1 else values
             if values.shape[1] != len(ranges):  # another number of frequencies
                 return torch.zeros((), dtype=torch.bool, device=values.device)
-            low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-            margin = _ROUNDING * torch.maximum(low.abs(), high.abs())
-            inside.append(((values >= low - margin) & (values <= high + margin)).all())
+            inside.append(in_ranges(values, ranges))
         return torch.stack(inside).all()
 
 
@@ -136,14 +134,8 @@ def _interpolation_error(profile: np.ndarray, weight: np.ndarray) -> Callable[[n
     """Measure the weighted error of cubics through every s-th row of a profile, (H,), linear beyond its ends."""
     height = len(profile)
     margin = 2 * _LARGEST_STRIDE
-    ends = (
-        profile[0],
-        profile[-1],
-        profile[min(1, height - 1)] - profile[0],
-        profile[-1] - profile[max(height - 2, 0)],
-    )
-    before = ends[0] - ends[2] * np.arange(margin, 0, -1)
-    after = ends[1] + ends[3] * np.arange(1, margin + 1)
+    before = profile[0] - (profile[min(1, height - 1)] - profile[0]) * np.arange(margin, 0, -1)
+    after = profile[-1] + (profile[-1] - profile[max(height - 2, 0)]) * np.arange(1, margin + 1)
     values = np.concatenate([before, profile, after])
 
     def largest(stride: int) -> float:
@@ -154,13 +146,8 @@ def _interpolation_error(profile: np.ndarray, weight: np.ndarray) -> Callable[[n
             place = (np.arange(height) + offset) / stride
             cell = np.floor(place).astype(int)
             t = place - cell
-            node = lambda k, cell=cell, offset=offset: values[margin - offset + (cell + k) * stride]  # noqa: E731 - short
-            cubic = (
-                node(-1) * (-t * (t - 1) * (t - 2) / 6)
-                + node(0) * ((t + 1) * (t - 1) * (t - 2) / 2)
-                + node(1) * (-(t + 1) * t * (t - 2) / 2)
-                + node(2) * ((t + 1) * t * (t - 1) / 6)
-            )
+            nodes = values[margin - offset + (cell + np.arange(-1, 3)[:, None]) * stride]
+            cubic = (nodes * lagrange_basis(t)).sum(axis=0)
             errors.append((weight * np.abs(cubic - profile)).max())
         return float(max(errors))
 

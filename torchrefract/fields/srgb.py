@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
+
+from torchrefract._tensor import as_device_tensor
 
 REC_709 = (0.2126, 0.7152, 0.0722)  # shares of red, green and blue in the luma
 # Where the line and the power of the curve meet. The standard rounds it to 0.0031308, and its inverse to 0.04045.
@@ -22,6 +25,12 @@ def color_per_channel(name: str, color: Sequence[float], channels: int) -> Seque
     if len(color) not in (1, channels):
         raise ValueError(f"{name} must have 1 number or {channels}, one for each channel, got {tuple(color)}")
     return color if len(color) == channels else [color[0]] * channels
+
+
+def color_of_images(name: str, color: Sequence[float], image: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return (B, C), a color as by `color_per_channel` for each image (B, C, H, W)."""
+    rows = [color_per_channel(name, color, image.shape[1])] * len(image)
+    return as_device_tensor(rows, dtype=dtype, device=image.device).view(image.shape[:2])
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:

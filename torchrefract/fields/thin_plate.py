@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchrefract._validation import check_values, eager_bool, requires_grad, why_not_eager
+from torchrefract._validation import check_values, eager_values, requires_grad, why_not_eager
 
 # Control points closer than this share of their extent count as equal.
 _NEAREST = 1e-6
@@ -104,10 +104,10 @@ def check_points(points: Tensor) -> None:
     apart = torch.cdist(centered, centered) + extent[:, None, None] * torch.eye(
         points.shape[1], dtype=extent.dtype, device=extent.device
     )
-    if eager_bool((apart.amin(dim=(1, 2)) > _NEAREST * extent).all, of=centered) is False:
+    if eager_values((apart.amin(dim=(1, 2)) > _NEAREST * extent).all, of=centered) is False:
         raise ValueError("points must differ from one another, got two equal ones")
     widths = torch.linalg.svdvals(centered.nan_to_num(0.0, 0.0, 0.0))
-    if eager_bool((widths[:, 1] > _FLATTEST * extent).all, of=centered) is False:
+    if eager_values((widths[:, 1] > _FLATTEST * extent).all, of=centered) is False:
         raise ValueError("points must not lie on one line, got a sample with collinear points")
 
 

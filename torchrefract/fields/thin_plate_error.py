@@ -17,8 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from torchrefract._tensor import in_ranges
 from torchrefract.random import LARGEST_NORMAL
 from torchrefract.types import FlowBounds, Range, Simplification
+from torchrefract.warping.lattice import lagrange_basis
 
 _SIGMAS = 7.0  # the two components of the error are longer with a probability of exp(-_SIGMAS^2 / 2), 2e-11
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
@@ -60,9 +62,9 @@ class ThinPlateErrorModel:
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: displacements and smoothing are such as can be drawn; points are not compared."""
-        low, high = (end * (1 + sign * 1e-5) for end, sign in zip(self.smoothing, (-1, 1), strict=True))
-        is_smooth = (params.smoothing >= low) & (params.smoothing <= high)
-        return is_smooth.all() & (params.displacement.abs() <= LARGEST_NORMAL * self.amplitude * (1 + 1e-5)).all()
+        largest = LARGEST_NORMAL * self.amplitude
+        is_drawn = in_ranges(params.displacement.reshape(-1, 1), [(-largest, largest)])
+        return is_drawn & in_ranges(params.smoothing[:, None], [self.smoothing])
 
 
 def _max_displacement(model: ThinPlateErrorModel) -> float:
@@ -135,17 +137,11 @@ def _deviation(splines: _UnitSplines, stride: float) -> float:
         corners = (cells * stride - center) / scale
         at_nodes = _kernel(corners[:, None, None] + step * nodes[:, None] - unit)  # (cells, nodes, P)
         for x, y in itertools.product(_INSIDE, repeat=2):
-            between = np.einsum("j,cjp->cp", np.outer(_cubic_weights(y / 6), _cubic_weights(x / 6)).ravel(), at_nodes)
+            weights_of_nodes = np.outer(lagrange_basis(y / 6), lagrange_basis(x / 6)).ravel()
+            between = np.einsum("j,cjp->cp", weights_of_nodes, at_nodes)
             error = (_kernel(corners[:, None] + step * np.array([x, y]) / 6 - unit) - between) @ weights[: len(unit)]
             largest = max(largest, float(np.sqrt((error**2).sum(axis=1)).max()))
     return largest
-
-
-def _cubic_weights(t: float) -> np.ndarray:
-    """Return the weights of the nodes -1, 0, 1, 2 in the cubic Lagrange polynomial at t."""
-    return np.array(
-        [-t * (t - 1) * (t - 2) / 6, (t * t - 1) * (t - 2) / 2, -t * (t + 1) * (t - 2) / 2, t * (t * t - 1) / 6]
-    )
 
 
 def _gradient(splines: _UnitSplines) -> float:

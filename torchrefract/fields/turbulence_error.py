@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import in_ranges
 from torchrefract.fields.random_field import REACH, Frequencies, embedding_size, gaussian_mixture, gradient_rms
 from torchrefract.types import FlowBounds, Range, Simplification
+from torchrefract.warping.lattice import lagrange_basis
 
 _SIGMAS = 7.0
 _DERIVATIVE_SIGMAS = 4.0  # errors and derivatives are not at their largest in the same place
@@ -73,10 +74,7 @@ class RandomFieldErrorModel:
         """Return (), bool: amplitude, length and aperture of each sample lie in the ranges, up to rounding."""
         names = ("amplitude", "length") if self.is_stream else ("amplitude", "length", "aperture")
         values = torch.stack([getattr(params, name) for name in names], dim=1)
-        ranges = [getattr(self, name) for name in names]
-        low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-        margin = 1e-5 * torch.maximum(low.abs(), high.abs())
-        return ((values >= low - margin) & (values <= high + margin)).all()
+        return in_ranges(values, [getattr(self, name) for name in names])
 
 
 @lru_cache(maxsize=256)
@@ -91,7 +89,7 @@ def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
             )
             gradient = _NARROW_APERTURE * steep
             gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
-        return FlowBounds(largest, gradient, lambda strides: np.full(np.shape(strides), np.inf))
+        return FlowBounds(largest, gradient)
 
     def interpolation_error(strides: np.ndarray) -> np.ndarray:
         spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)
@@ -192,9 +190,8 @@ def _cubic_error_table(is_stream: bool) -> tuple[np.ndarray, np.ndarray]:
     k = np.linspace(-_REACH, _REACH, 161)
     density = np.exp(-0.5 * k * k)
     place, nodes = np.arange(_PLACES) / _PLACES, np.arange(-1, 3)
-    weights = [math.prod(((place - m) / (n - m) for m in nodes if m != n), start=np.ones(_PLACES)) for n in nodes]
     wave = np.exp(1j * np.exp(logs)[:, None, None, None] * (nodes - place[:, None])[..., None] * k)
-    transfer = (wave * np.stack(weights, axis=1)[..., None]).sum(axis=2)  # (spacings, places, k)
+    transfer = (wave * np.stack(lagrange_basis(place), axis=1)[..., None]).sum(axis=2)  # (spacings, places, k)
     share_x = density / density.sum()
     share_y = density * k * k / (density * k * k).sum() if is_stream else share_x
     mean_x, mean_y = (transfer @ share for share in (share_x, share_y))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_count, check_flow, check_positive, check_tensor, eager_bool, requires_grad
+from torchrefract._validation import check_count, check_flow, check_positive, check_tensor, eager_values, requires_grad
 from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.implicit import LinearSample, implicit, sample_linear
@@ -106,7 +106,7 @@ def _newton(table: Tensor, p: Tensor, start: Tensor, node: Tensor, steps: int) -
         better = _merit(trial_error, sample) < _merit(error, best)
         q, error = torch.where(better, trial, q), torch.where(better, trial_error, error)
         best = LinearSample(*(torch.where(better, new, old) for new, old in zip(sample, best, strict=True)))
-        if eager_bool((_merit(error, best) <= rounding**2).all, of=error):
+        if eager_values((_merit(error, best) <= rounding**2).all, of=error):
             break
         if step > 0:  # the first trial is the second start, whose failure says nothing about the step length
             length = torch.where(better, (2 * length).clamp(max=1), length / 2)

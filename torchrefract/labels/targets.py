@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from torchrefract._validation import check_choice, check_flag, check_tensor, eager_bool, warn
+from torchrefract._validation import check_choice, check_flag, check_tensor, eager_values, warn
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.plain_values import check_moves, name_of
@@ -155,10 +155,10 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
         siblings = {name: leaves[k] for name, k in _siblings(paths, i).items()}
         check_moves(path, leaf, siblings, (flow.shape[-2], flow.shape[-1]))
     is_zero = (flow == 0).flatten(-3).all(dim=-1) if options.keep_unmoved else None
-    if is_zero is not None and eager_bool(is_zero.all, of=is_zero):
+    if is_zero is not None and eager_values(is_zero.all, of=is_zero):
         return sample
     warped = [_warp_leaf(leaf, flow, options) for leaf in leaves]
-    if is_zero is not None and eager_bool(is_zero.any, of=is_zero) is not False:
+    if is_zero is not None and eager_values(is_zero.any, of=is_zero) is not False:
         warped = [_restore_unmoved(leaf, one, is_zero) for leaf, one in zip(leaves, warped, strict=True)]
     values = [one.value for one in warped]
     boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes")]

@@ -76,12 +76,23 @@ def why_unsupported(image: Tensor, flow: Tensor) -> str | None:
     return None
 
 
-def sample(image: Tensor, flow: Tensor, *, padding: str, limit: float, active: Tensor | None = None) -> Tensor:
-    """Sample an image at p + flow(p).
+def sample_lattice(
+    image: Tensor,
+    nodes: Tensor,
+    weights: Tensor | None,
+    *,
+    margin: int,
+    padding: str,
+    limit: float,
+    active: Tensor | None = None,
+) -> Tensor:
+    """Sample an image along a flow at the nodes of a lattice, with cubics between them, or at every pixel.
 
     Args:
         image: (N, C, H, W), float32 or uint8, of any strides.
-        flow: (N or 1, 2, H, W), px, float32.
+        nodes: (N or 1, 2, h, w), px, float32, every `stride` px; the pixels if there are no weights.
+        weights: (stride, 4), of the nodes around a pixel by its position in its cell; None for a flow at every pixel.
+        margin: nodes before the first pixel, at least 1, or 0 without weights.
         padding: "zeros", "border" or "reflection".
         limit: the largest position, in the coordinates of F.grid_sample; NaN counts as that position.
         active: (N,), bool, samples to warp; the others are copied. None for all.
@@ -89,57 +100,19 @@ def sample(image: Tensor, flow: Tensor, *, padding: str, limit: float, active: T
     Returns:
         (N, C, H, W), of the type of the image, channels_last if the image is.
     """
-    return _sample(image, flow, None, (0, 0), padding=padding, limit=limit, active=active)
-
-
-def sample_lattice(
-    image: Tensor,
-    nodes: Tensor,
-    weights: Tensor,
-    *,
-    margin: int,
-    padding: str,
-    limit: float,
-    active: Tensor | None = None,
-) -> Tensor:
-    """Sample an image along a flow at the nodes of a lattice, with cubics between them.
-
-    Args:
-        image: (N, C, H, W), float32 or uint8, of any strides.
-        nodes: (N or 1, 2, h, w), px, float32, every `stride` px, with `margin` nodes before the first pixel.
-        weights: (stride, 4), of the nodes around a pixel by its position in its cell.
-        margin: nodes before the first pixel, at least 1.
-        padding, limit, active: as for `sample`.
-
-    Returns:
-        (N, C, H, W), of the type of the image, channels_last if the image is.
-    """
-    lattice = weights.shape[0], margin
-    return _sample(image, nodes, weights, lattice, padding=padding, limit=limit, active=active)
-
-
-def _sample(
-    image: Tensor,
-    flow: Tensor,
-    weights: Tensor | None,
-    lattice: tuple[int, int],
-    *,
-    padding: str,
-    limit: float,
-    active: Tensor | None,
-) -> Tensor:
     batch, channels, height, width = image.shape
     # Not `empty_like`, which gives an image of one pixel other strides.
     layout = torch.channels_last if is_channels_last(image) else torch.contiguous_format
     out = torch.empty(image.shape, dtype=image.dtype, device="cpu", memory_format=layout)
-    table = flow.new_zeros(4, 1) if weights is None else weights.to(flow.dtype).mT.contiguous()
+    stride = 0 if weights is None else len(weights)
+    table = nodes.new_zeros(4, 1) if weights is None else weights.to(nodes.dtype).mT.contiguous()
     mask = torch.ones(batch, dtype=torch.bool, device="cpu") if active is None else active.expand(batch).contiguous()
     arguments = (
         _elements(image),
         (channels, height, width),
         image.stride(),
-        flow.detach().contiguous().numpy(),
-        lattice,
+        nodes.detach().contiguous().numpy(),
+        (stride, margin),
         table.numpy(),
         mask.numpy(),
         _PADDINGS[padding],

@@ -21,7 +21,7 @@ from torchrefract._tensor import (
     round_to_dtype,
     without_autocast,
 )
-from torchrefract._validation import eager_bool, requires_grad, why_not_eager
+from torchrefract._validation import eager_values, requires_grad, why_not_eager
 
 PADDINGS = ("zeros", "border", "reflection")
 INTERPOLATIONS = ("nearest", "bilinear", "bicubic")
@@ -70,11 +70,12 @@ def sample(
     dtype = sampling_dtype(image, flow.dtype)
     flow = flow.to(dtype)
     choice = {"backend": backend, "interpolation": interpolation, "is_lattice": False}
-    if _uses("numba", image, flow, **choice):
+    numba = _chosen("numba", image, flow, **choice)
+    if numba is not None:
         source = image if image.dtype is torch.uint8 else image.to(dtype)
-        sampled = _backend("numba").sample(source, flow, padding=padding, limit=DENSE_LIMIT, active=active)
-        return _like(sampled, image)
-    _uses("triton", image, flow, **choice)  # raises if the caller chose it
+        options = {"margin": 0, "padding": padding, "limit": DENSE_LIMIT, "active": active}
+        return _like(numba.sample_lattice(source, flow, None, **options), image)
+    _chosen("triton", image, flow, **choice)  # raises if the caller chose it
     return _by_torch(image, sampler_grid(flow), dtype, padding=padding, interpolation=interpolation, active=active)
 
 
@@ -113,12 +114,13 @@ def sample_lattice(
     nodes, limit = nodes.to(dtype), LATTICE_LIMIT
     choice = {"backend": backend, "interpolation": interpolation, "is_lattice": True}
     fast = backend if backend in _MODULES else "triton" if image.is_cuda else "numba"
-    if _uses(fast, image, nodes, **choice):
+    module = _chosen(fast, image, nodes, **choice)
+    if module is not None:
         source = image if fast == "numba" and image.dtype is torch.uint8 else image.to(dtype)
         weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
         options = {"margin": margin, "padding": padding, "limit": limit, "active": active}
         nodes = _finite(nodes, limit * max(height, width))
-        return _like(_backend(fast).sample_lattice(source, nodes, weights, **options), image)
+        return _like(module.sample_lattice(source, nodes, weights, **options), image)
     # The positions of the pixels are linear, so the cubics keep them when they are added at the nodes.
     start = -margin * stride
     y, x = (start + stride * torch.arange(n, dtype=dtype, device=nodes.device) for n in nodes.shape[2:])
@@ -176,8 +178,8 @@ def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -
     return as_device_tensor(_constant_weights(stride), dtype=dtype, device=device)
 
 
-def lagrange_basis(t: Tensor) -> list[Tensor]:
-    """Evaluate each of the four weights of `lagrange_weights` at any t, in its shape."""
+def lagrange_basis(t: Any) -> list[Any]:
+    """Evaluate each of the four weights of `lagrange_weights` at a number, an array or a tensor t, in its shape."""
     below, above, far = t + 1, t - 1, t - 2
     outer, inner = t * below, above * far
     return [t * inner / -6, below * inner / 2, outer * far / -2, outer * above / 6]
@@ -251,7 +253,7 @@ def _finite(values: Tensor, limit: float) -> Tensor:
     """Clamp values to [-limit, limit], and replace NaN by `limit`."""
     # With border padding, one NaN in a grid ends the process in the backward pass of F.grid_sample.
     is_bounded = lambda: torch.stack(values.aminmax()).abs().amax() <= limit  # noqa: E731 - used once
-    if values.numel() == 0 or eager_bool(is_bounded, of=values):
+    if values.numel() == 0 or eager_values(is_bounded, of=values):
         return values
     return values.nan_to_num(nan=limit, posinf=limit, neginf=-limit).clamp(-limit, limit)
 
@@ -274,15 +276,15 @@ def _like(values: Tensor, image: Tensor) -> Tensor:
     return values.to(image.dtype).contiguous(memory_format=layout)
 
 
-def _uses(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation: str, is_lattice: bool) -> bool:
-    """Return True if the backend `name` samples the image; raise if the caller chose it and it cannot."""
+def _chosen(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation: str, is_lattice: bool) -> Any:
+    """Return the module of a backend that samples the image, or None; raise if the caller chose it and it cannot."""
     if backend not in ("auto", name) or requires_grad((image, flow)):
-        return False
+        return None
     if backend == "auto" and (name == "triton") != image.is_cuda:
-        return False
+        return None
     if name == "numba" and backend == "auto" and image.shape[2] * image.shape[3] < _SMALLEST_NUMBA_FRAME:
-        return False
-    why = None
+        return None
+    why = module = None
     if interpolation != "bilinear":
         why = f"{interpolation} interpolation"
     elif not is_lattice and name == "triton":
@@ -298,7 +300,7 @@ def _uses(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation
         why = f"no {name} installed" if module is None else module.why_unsupported(image, flow)
     if why is not None and backend == name:
         raise ValueError(f"backend={name!r} supports {_SUPPORTED[name]}, got {why}; use backend='auto'")
-    return why is None
+    return module if why is None else None
 
 
 @assume_constant_result

@@ -28,8 +28,7 @@ class PlannedWarp(NamedTuple):
     has_closed_form: bool  # the flow at a displaced point needs no lattice of its own, and one may interpolate it
 
 
-@dataclass(frozen=True)
-class CompositionPlan:
+class CompositionPlan(NamedTuple):  # torch.compile reads the fields of a constant tuple, but not of a dataclass
     """The plan of the composed flow of warps in a row.
 
     stride: px between the nodes of the first lattice that is measured; 1 computes every pixel.

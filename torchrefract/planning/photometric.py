@@ -10,12 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor, cached_constant
+from torchrefract._tensor import cached_constant
 from torchrefract.fields.fog_volume import VARIANCE
-from torchrefract.types import Range
 
 LEVELS = 255.0
 _SIGMAS = 7.0  # of random bounds
@@ -277,13 +274,6 @@ def _levels_of_light(x: float) -> float:
     """Return the largest change of the image in levels for a change of its linear light."""
     # The curve is concave, so two values apart by x come out apart by its value at x at most.
     return LEVELS * (_STEEPEST_SRGB * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055)
-
-
-def in_ranges(values: Tensor, ranges: Sequence[Range]) -> Tensor:
-    """Return (), bool: all values (B, n) lie in the n ranges, up to rounding."""
-    low, high = as_device_tensor(ranges, dtype=values.dtype, device=values.device).unbind(1)
-    margin = 1e-5 * torch.maximum(low.abs(), high.abs())
-    return ((values >= low - margin) & (values <= high + margin)).all()
 
 
 def noise_mean_variance(period: float, height: int, width: int) -> float:

@@ -1,7 +1,6 @@
 """The plan of one warp: the coarsest lattice and the fewest terms that keep its flow within a tolerance."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -186,7 +185,8 @@ def plan_warp(model: ErrorModel | None, request: PlanRequest) -> WarpPlan:
         return exact if simplified is None else replace(exact, reason="the tolerance is too small for fewer terms")
     stride = coarsest_stride(bounds, simplified, budget, is_random=model.is_random)
     between = float(bounds.interpolation_error(np.array([float(stride)]))[0]) if stride > 1 else 0.0
-    error = add_errors([simplified.error_px, between], is_random=model.is_random)
+    # Independent random errors add as squares.
+    error = math.hypot(simplified.error_px, between) if model.is_random else simplified.error_px + between
     if stride == 1 and simplified.error_px == 0:
         return replace(exact, reason=simplified.why or "the flow bends too much for a lattice")
     return replace(
@@ -213,11 +213,6 @@ def coarsest_stride(bounds: FlowBounds, simplified: Simplification, budget_px: f
     if len(too_coarse):
         fitting = fitting[fitting < too_coarse[0]]
     return STRIDES[fitting[-1]] if len(fitting) else 1
-
-
-def add_errors(errors: Sequence[float], *, is_random: bool) -> float:
-    """Add bounds; those of independent random errors add as squares."""
-    return math.hypot(*errors) if is_random else sum(errors)
 
 
 def lattice_with_stride(height: int, width: int, stride: int) -> Lattice:

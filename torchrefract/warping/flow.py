@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import as_device_tensor, exact_matmul
-from torchrefract._validation import check_count, check_flow, check_tensor, eager_bool
+from torchrefract._validation import check_count, check_flow, check_tensor, eager_values
 from torchrefract.types import Folding
 from torchrefract.warping.grid import field_dtype, length, pixel_axes
 from torchrefract.warping.warp import sample_image
@@ -183,7 +183,7 @@ def is_shown_once(flow: Tensor, inverse: Tensor, exists: Tensor, valid: Tensor |
             is_excluded = is_excluded | ~(norm <= _LARGEST_STRETCH * jacobian.determinant)
         if valid is not None:
             is_excluded = is_excluded & ~_near_invalid(valid)
-        if eager_bool(is_excluded.any, of=flow) is False:
+        if eager_values(is_excluded.any, of=flow) is False:
             return ~is_excluded
         return ~_cover(flow, is_excluded)
 
@@ -265,7 +265,7 @@ def _keys_weights(old: int, new: int, *, like: Tensor) -> Tensor:
     """Return the weight of each of `old` pixels in each of `new` ones along an axis, (new, old)."""
     positions = (torch.arange(new, dtype=torch.float64, device=like.device) + 0.5) * (old / new) - 0.5
     nodes = torch.arange(-_GHOSTS, old + _GHOSTS, dtype=torch.float64, device=like.device)
-    weights = _keys(positions[:, None] - nodes)
+    weights = keys_cubic(positions[:, None] - nodes)
     result = weights[:, _GHOSTS:-_GHOSTS].clone()
     for k in range(1, _GHOSTS + 1):
         # The ghost k px beyond the border pixel f_0 is f_0 + k (f_0 - f_1), so it lies on the line through both.
@@ -276,8 +276,8 @@ def _keys_weights(old: int, new: int, *, like: Tensor) -> Tensor:
     return result.to(like.dtype)
 
 
-def _keys(t: Tensor) -> Tensor:
-    """Evaluate Keys' cubic with a = -1/2 at distances in px."""
+def keys_cubic(t: Tensor) -> Tensor:
+    """Evaluate Keys' cubic with a = -1/2 at distances t from a node, in strides."""
     t = t.abs()
     near, far = (1.5 * t - 2.5) * t * t + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2
-    return torch.where(t < 1, near, F.relu(2 - t).sign() * far)
+    return torch.where(t < 1, near, torch.where(t < 2, far, 0))

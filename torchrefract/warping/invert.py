@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._tensor import rows_at_once
-from torchrefract._validation import check_count, check_flow, check_positive, eager_bool, eager_values, requires_grad
+from torchrefract._validation import check_count, check_flow, check_positive, eager_values, requires_grad
 from torchrefract.ops.sampling import grid_sample, sample, sampling_dtype
 from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes
@@ -57,7 +57,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
     if flow.numel() == 0:
         return flow.clone(), flow[:, :1] == 0, flow[:, :1].clone()
     is_finite = (flow.detach().abs() <= _LARGEST_FLOW).all(dim=1, keepdim=True)
-    has_holes = not eager_bool(is_finite.all, of=flow)
+    has_holes = not eager_values(is_finite.all, of=flow)
     flow = torch.where(is_finite, flow, 0) if has_holes else flow
     with torch.no_grad():
         values = flow.detach().to(sampling_dtype(flow, flow.dtype))
@@ -80,7 +80,7 @@ def _solve(flow: Tensor, steps: int, *, is_eager: bool) -> tuple[Tensor, Tensor,
     """Return the inverse (B, 2, H, W), its residual, px, and the Jacobian determinant at p + inverse, (B, 1, H, W)."""
     height, width = flow.shape[2:]
     gradient = _gradient(flow)
-    is_upright = eager_bool(lambda: _determinant(gradient).amin() >= _SMALLEST_DETERMINANT, of=flow)
+    is_upright = eager_values(lambda: _determinant(gradient).amin() >= _SMALLEST_DETERMINANT, of=flow)
     rows = rows_at_once(flow.device, height, each=width, cached=_BAND_PIXELS) if is_eager else height
     bands = []
     for start in range(0, height, rows):

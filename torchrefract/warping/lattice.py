@@ -1,12 +1,12 @@
 """Flows at the nodes of a coarse lattice, with cubics between the nodes."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import cat_bands, rows_at_once
+from torchrefract._tensor import in_bands, rows_at_once
 from torchrefract._validation import eager_values
 from torchrefract.ops.sampling import interpolate_nodes, lagrange_basis
 from torchrefract.warping.grid import Points
@@ -63,18 +63,9 @@ class LatticeFlow:
     nodes: Tensor
     lattice: Lattice
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Return the type of the nodes."""
-        return self.nodes.dtype
-
     def detach(self) -> "LatticeFlow":
         """Return the flow without its gradient."""
-        return self.with_nodes(self.nodes.detach())
-
-    def with_nodes(self, nodes: Tensor) -> "LatticeFlow":
-        """Return a flow with other nodes on the same lattice."""
-        return replace(self, nodes=nodes)
+        return LatticeFlow(self.nodes.detach(), self.lattice)
 
     def dense(self) -> Tensor:
         """Return the flow at every pixel, (N, 2, H, W), px."""
@@ -106,9 +97,12 @@ class LatticeFlow:
         rows, columns = self.nodes.shape[2:]
         x, y = _in_strides(points.x, lattice, columns), _in_strides(points.y, lattice, rows)
         count, each = torch.broadcast_shapes(x.shape, y.shape)[2:]
+
+        def at_rows(start: int, stop: int) -> Tensor:
+            return _cubic(self.nodes, x if x.shape[2] == 1 else x[:, :, start:stop], y[:, :, start:stop])
+
         band = rows_at_once(x.device, count, each=each, cached=_CACHED_POINTS)
-        bands = ([at if at.shape[2] == 1 else at[:, :, i : i + band] for at in (x, y)] for i in range(0, count, band))
-        return cat_bands((_cubic(self.nodes, x, y) for x, y in bands), dim=2, length=count)
+        return in_bands(at_rows, length=count, band=band, dim=2)
 
 
 def within_reach(points: Points) -> Points:

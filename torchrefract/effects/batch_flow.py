@@ -281,7 +281,7 @@ class BatchFlow:
     @property
     def is_zero(self) -> bool:
         """Return True if no flow was computed, because none exceeds the tolerance."""
-        return all([part.is_zero for part in self.parts])
+        return all(part.is_zero for part in self.parts)
 
     @property
     def dense(self) -> Tensor:

@@ -87,7 +87,7 @@ class Compose(Effect):
     @property
     def keeps_uint8(self) -> bool:
         """Return True if all effects do."""
-        return all([effect.keeps_uint8 for effect in self.effects])
+        return all(effect.keeps_uint8 for effect in self.effects)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> ComposeParams:
         """Draw the parameters of each effect from a stream of its own."""
@@ -218,7 +218,7 @@ class Compose(Effect):
         middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
         # The share must not depend on the warps that move other samples of the batch. Of several warps it is half as
         # large, since the inverse of one stretches the errors of the others.
-        num_warps = len([leaf for leaf in leaves if isinstance(leaf.effect, WarpEffect)])
+        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
         num_shares = num_warps if num_warps == 1 else 2 * num_warps
         share_px = None if request.tolerance_px is None else request.tolerance_px / num_shares
         progress.move(moving, active, middle, share_px, exposures=parts)

@@ -57,6 +57,17 @@ def test_frames_of_a_video_are_evenly_spaced_and_a_blank_one_is_warned_of(call, 
     assert vague.startswith("warning: the lens cannot be distinguished from no distortion (95 %)")
 
 
+def test_frames_of_several_drives_by_their_names_are_warned_of(call, folder):
+    for i, name in enumerate(("front_1", "front_2", "front_3", "rear_1", "rear_2", "rear_3")):
+        (folder / "raw" / f"{i}.png").rename(folder / "raw" / f"{name}.png")
+    outcome = call("estimate_lens", "input=raw")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "warning: frames of 2 drives by their names, front, rear, are taken for those of one camera: "
+        "estimate each camera by itself\n"
+    )
+
+
 def test_a_damaged_video_is_named_and_the_others_are_used(call, folder):
     (folder / "raw" / "bad.mp4").write_bytes(b"no video")
     outcome = call("estimate_lens", "input=raw")

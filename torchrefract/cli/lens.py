@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._validation import UsageError, check_count
+from torchrefract._validation import UsageError, check_count, first_names
 from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
@@ -18,7 +18,7 @@ from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
 from torchrefract.cli.command import print_warning, progress
 from torchrefract.cli.options import find_device, naming, read_option
 from torchrefract.data import media
-from torchrefract.data.frames import evenly_spaced
+from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
 from torchrefract.warping.flow import resize_image
 
@@ -36,6 +36,12 @@ def estimate_lens(cfg: DictConfig) -> None:
     files = media.find_media(Path(str(cfg.input)))
     if turned := media.describe_turned(files):
         print_warning(turned)
+    drives = sorted(set(drives_of([file.as_posix() for file in files], "prefix").values()))
+    if len(drives) > 1:
+        print_warning(
+            f"frames of {len(drives)} drives by their names, {first_names(drives)}, are taken for those of one camera: "
+            "estimate each camera by itself"
+        )
     predict = None if cfg.checkpoint is None else _load_network(cfg)
     estimate_camera(files, out, max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
 

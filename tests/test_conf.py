@@ -1,4 +1,5 @@
 import inspect
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -7,9 +8,10 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from pytorch_lightning import Trainer
+from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import Logger
+from torch.utils.data import DataLoader, TensorDataset
 
 import torchrefract
 from torchrefract import presets
@@ -283,3 +285,40 @@ def test_a_task_accepts_another_scene_and_a_user_may_add_tasks(tmp_path):
     )
     cfg = compose_training(tmp_path, "+task=mine", f"hydra.searchpath=[file://{tmp_path}]")
     assert instantiate(cfg.task).limit == 0.5
+
+
+class Worsening(LightningModule):
+    """Has the better of both metrics in its first epoch."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+
+    def training_step(self, batch, _):
+        return self.weight * batch[0].sum()
+
+    def validation_step(self, *_):
+        self.log_dict({"val/epe": float(self.current_epoch), "val/psnr": -float(self.current_epoch)})
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=1.0)
+
+
+# Lightning warns of small trainings, of its own code, and of a folder that is continued.
+@pytest.mark.filterwarnings("ignore:.*LeafSpec", "ignore:.*many workers", "ignore:.*exists and is not empty")
+@pytest.mark.parametrize("task", options("task"))
+def test_the_last_checkpoint_is_that_of_the_last_epoch_even_if_the_best_is_earlier(tmp_path, task):
+    callbacks = compose_training(tmp_path, f"+task={task}").trainer.callbacks
+    kept = [instantiate(callback) for callback in callbacks if "ModelCheckpoint" in callback._target_]
+    batches = DataLoader(TensorDataset(torch.ones(2, 1)), batch_size=1)
+    options: Any = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "num_sanity_val_steps": 0}
+    trainer = Trainer(max_epochs=3, callbacks=kept, enable_model_summary=False, **options)
+    trainer.fit(Worsening(), batches, batches)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "last.ckpt"]
+    for name, epoch in (("best", 0), ("last", 2)):
+        assert torch.load(tmp_path / f"{name}.ckpt", weights_only=True)["epoch"] == epoch
+    resumed = Trainer(max_epochs=4, callbacks=[*map(copy, kept)], enable_model_summary=False, **options)
+    resumed.fit(Worsening(), batches, batches, ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "last.ckpt"]
+    for name, epoch in (("best", 0), ("last", 3)):
+        assert torch.load(tmp_path / f"{name}.ckpt", weights_only=True)["epoch"] == epoch

@@ -253,10 +253,7 @@ def test_invalid_options_are_one_line_of_error(call, options, message):
 def test_edge_rays_of_real_pictures_are_near_the_published_camera(call, shared_data, tmp_path):
     board = ("squares=4x5", "square_mm=54", "marker_mm=40.5", "dictionary=DICT_4X4_1000")
     folder = shared_data / "charuco" / "caliscope_cam0"
-    (tmp_path / "pictures").mkdir()
-    for path in sorted(folder.glob("*.jpg"))[::2]:
-        (tmp_path / "pictures" / path.name).symlink_to(path)
-    assert call("calibrate", "images=pictures", *board, "out=out").code == 0
+    assert call("calibrate", f"images={folder}", *board, "out=out").code == 0
     camera = read_opencv(tmp_path / "out" / "camera.yaml")
     numbers = json.loads((folder.parent / "reference.json").read_text())[folder.name]["published"]
     pinhole = {key: numbers[key] for key in ("fx", "fy", "cx", "cy")}

@@ -39,7 +39,7 @@ def test_two_nodes_train_on_each_pair_once_and_validate_each_once(tars, small, t
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     words = ["+task=undistort", "data=pairs", f"data.root={tars}", "data.buffer=8", "data.batch_size=3"]
-    words += ["data.workers=0", "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2"]
+    words += ["data.workers=1", "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2"]
     words += [word for word in small if not word.startswith("data.")] + ["trainer.max_epochs=1"]
     agent = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
     agent += ["--master-addr=127.0.0.1", f"--master-port={port}"]

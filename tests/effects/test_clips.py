@@ -29,10 +29,9 @@ SINGLE: dict[str, Effect] = {
     "heterogeneous fog": tr.HeterogeneousFog(wind_x_range=(5.0, 9.0), decorrelation_range=(2.0, 4.0)),
     "volumetric fog": tr.HeterogeneousFog(mode="ray", wind_z_range=(-2.0, -1.0), decorrelation_range=(2.0, 4.0)),
 }
-MIXED = [SINGLE[name] for name in ("lens", "turbulence", "rolling shutter", "flare", "exposure", "volumetric fog")]
 COMPOSED: dict[str, Effect] = {
-    "compose": tr.Compose(MIXED),
-    "one of": tr.OneOf(MIXED),
+    "compose": tr.Compose(list(SINGLE.values())),
+    "one of": tr.OneOf(list(SINGLE.values())),
     "with p of 0.5": tr.Compose(
         [tr.LensDistortion(p=0.5), tr.Turbulence(**FIELD, **FAST, p=0.5), tr.UniformFog(p=0.5)]
     ),

@@ -55,7 +55,7 @@ def picture(batch: int = 2) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", tolerance.CONFIGURATIONS)
 def test_random_configurations_stay_within_their_tolerance(name):
-    for seed in range(1000, 1004):
+    for seed in range(1000, 1004 if name == "Compose" else 1008):
         trial = tolerance.attempt(name, seed, (160, 240))
         assert 0 <= trial.share <= 1, trial
         assert 0 <= trial.restore_share <= 1, trial

@@ -26,7 +26,7 @@ from torchrefract.data.images import (
     upright_exif,
     warn_of_unread,
 )
-from torchrefract.data.video import (  # noqa: F401 - readers and writers of videos, which this module offers too
+from torchrefract.data.video import (
     can_write_videos,
     convert_video,
     count_frames,
@@ -36,6 +36,23 @@ from torchrefract.data.video import (  # noqa: F401 - readers and writers of vid
     video_losses,
     write_video,
 )
+
+__all__ = [
+    "VIDEOS",
+    "can_write_videos",
+    "check_output_folder",
+    "convert_video",
+    "describe_losses",
+    "describe_turned",
+    "find_media",
+    "is_complete",
+    "is_video",
+    "output_name",
+    "read_video",
+    "video_info",
+    "write_picture",
+    "write_video",
+]
 
 # OpenCV prints to the terminal; problems are raised as errors instead.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -36,12 +36,6 @@ def estimate_lens(cfg: DictConfig) -> None:
     files = media.find_media(Path(str(cfg.input)))
     if turned := media.describe_turned(files):
         print_warning(turned)
-    drives = sorted(set(drives_of([file.as_posix() for file in files], "prefix").values()))
-    if len(drives) > 1:
-        print_warning(
-            f"frames of {len(drives)} drives by their names, {first_names(drives)}, are taken for those of one camera: "
-            "estimate each camera by itself"
-        )
     predict = None if cfg.checkpoint is None else _load_network(cfg)
     estimate_camera(files, out, max_frames=max_frames, fov_deg=cfg.fov_deg, predict=predict)
 
@@ -56,6 +50,12 @@ def estimate_camera(
     upright: bool = False,
 ) -> Camera:
     """Estimate the camera of at most so many frames of files, write it to `out`, and print how certain it is."""
+    drives = sorted(set(drives_of([file.as_posix() for file in files], "prefix").values()))
+    if len(drives) > 1:
+        print_warning(
+            f"frames of {len(drives)} drives by their names, {first_names(drives)}, are taken for those of one camera: "
+            "estimate each camera by itself"
+        )
     with naming("out"):
         out.parent.mkdir(parents=True, exist_ok=True)
     chosen = _select_frames(files, max_frames)

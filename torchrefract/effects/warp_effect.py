@@ -228,7 +228,8 @@ class WarpEffect(Effect):
         if flow.is_zero and len(moments) == 1:
             return unchanged(image, drawn)
         active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
-        moves, options = expand_batch(active, len(image)), SamplingOptions().or_else(self)
+        moves = expand_batch(active, len(image))
+        options = SamplingOptions(self.padding, self.interpolation, self.backend)
 
         def sampled(source: Tensor, k: int) -> Tensor:
             along = flow if len(moments) == 1 else self.flow_by_plan(params.at(moments[k]), height, width)

@@ -132,17 +132,17 @@ def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
     return (position / lattice.stride + lattice.margin).nan_to_num(nan=0.0).clamp(0, count - 1)
 
 
-def _cells(index: Tensor, count: int) -> tuple[Tensor, list[Tensor]]:
+def _cells(index: Tensor, count: int, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
     """Return the first of the four nodes around each fractional index, int64, and the weights of the four."""
     second = index.detach().clamp(1, count - 3).long()
-    return second - 1, lagrange_basis(index - second)
+    return second - 1, [weight.to(dtype) for weight in lagrange_basis(index - second)]
 
 
 def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """Interpolate nodes (N, 2, h, w) at fractional indices x and y, which broadcast to (N or 1, 1, n, m)."""
     batch, _, rows, columns = nodes.shape
-    column, weights_x = _cells(x[:, 0], columns)
-    row, weights_y = _cells(y[:, 0], rows)
+    column, weights_x = _cells(x[:, 0], columns, nodes.dtype)
+    row, weights_y = _cells(y[:, 0], rows, nodes.dtype)
     first = row * columns + column  # of the 4 x 4 nodes
     if batch > 1:
         first = first + rows * columns * torch.arange(batch, device=nodes.device).view(-1, 1, 1)
@@ -154,7 +154,7 @@ def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:
             line = torch.zeros((), dtype=nodes.dtype, device=nodes.device)
             for j, weight_x in enumerate(weights_x):
                 node = values[i * columns + j :].index_select(0, index).view(first.shape)
-                line = torch.addcmul(line, weight_x.to(nodes.dtype), node)
-            component = torch.addcmul(component, weight_y.to(nodes.dtype), line)
+                line = torch.addcmul(line, weight_x, node)
+            component = torch.addcmul(component, weight_y, line)
         components.append(component)
     return torch.stack(components, dim=1)

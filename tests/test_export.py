@@ -97,7 +97,10 @@ def test_a_model_with_several_passes_is_rejected(call, brighter, monkeypatch):
         ("size=72", "size must be HEIGHTxWIDTH, such as 720x1280, got 72"),
         ("size=0x72", "size must be HEIGHTxWIDTH, such as 720x1280, got 0x72"),
         ("interpolation=cubic", "interpolation must be one of nearest, bilinear, bicubic"),
-        ("ckpt_path=none.ckpt", "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
+        (
+            "ckpt_path=none.ckpt",
+            "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, or the name lens_small, got none.ckpt",
+        ),
     ],
 )
 def test_an_invalid_option_is_one_line_of_error(call, tmp_path, brighter, word, message):

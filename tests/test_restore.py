@@ -301,7 +301,10 @@ def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
         (("side_by_side=2",), "side_by_side must be True or False, got 2"),
         (("pool=lens",), "pool must be auto, null, or lens for the task undistort, got lens for deweather"),
         (("device=gpu",), "device must be auto, cpu or another device of this machine, got gpu"),
-        (("ckpt_path=none.ckpt",), "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
+        (
+            ("ckpt_path=none.ckpt",),
+            "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, or the name lens_small, got none.ckpt",
+        ),
         (("ckpt_path=raw/a.png",), "ckpt_path must be an intact checkpoint, got raw/a.png, which is damaged"),
         (("tiles=3",), "an option must be one of ckpt_path, input, out, size, tile,"),
         (("+model.depth=3",), "ckpt_path must be of a model that can be built"),

@@ -255,7 +255,10 @@ def test_a_training_starts_with_the_weights_and_the_licenses_of_a_checkpoint(cal
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("init_from=none.ckpt",), "init_from must be a checkpoint file, such as <run>/last.ckpt, got none.ckpt"),
+        (
+            ("init_from=none.ckpt",),
+            "init_from must be a checkpoint file, such as <run>/last.ckpt, or the name lens_small, got none.ckpt",
+        ),
         (("init_from=lens_small",), "init_from must be a checkpoint of ResUNet (tu-test_resnet), which model= names"),
         (("+task=deweather", "scene=cape_town_fog", "init_from=lens_small"), "init_from must be a checkpoint of the "),
     ],

@@ -267,7 +267,7 @@ def test_an_evaluation_without_a_checkpoint_names_the_option(call):
     message = "ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none"
     assert call("eval").message == message
     assert call("eval", "ckpt_path=a=1.ckpt").message.endswith(
-        "must be a checkpoint file, such as <run>/last.ckpt, got a=1.ckpt"
+        "must be a checkpoint file, such as <run>/last.ckpt, or the name lens_small, got a=1.ckpt"
     )
 
 

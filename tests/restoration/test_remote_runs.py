@@ -56,7 +56,8 @@ def test_a_run_in_a_store_is_stopped_continued_scored_and_applied(call, small, s
 
 def test_a_checkpoint_that_is_missing_in_a_store_is_one_line_of_error(call, small, store):
     message = call("train", "+task=undistort", *small, f"ckpt_path={store}/none.ckpt").message
-    assert message == f"ckpt_path must be a checkpoint file, such as <run>/last.ckpt, got {store}/none.ckpt"
+    expected = "ckpt_path must be a checkpoint file, such as <run>/last.ckpt, or the name lens_small, got "
+    assert message == f"{expected}{store}/none.ckpt"
 
 
 def test_a_run_folder_in_a_store_that_denies_writing_is_one_line_of_error(call, small, monkeypatch):

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from torchrefract._io import as_path, local_file, make_folder, replace_file
 from torchrefract._validation import UsageError
-from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, read_weights
+from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, model_names, read_weights
 from torchrefract.restoration.tasks import Task
 
 _PACKAGE = "torchrefract."
@@ -211,7 +211,10 @@ def read_checkpoint(path: Path, *, task: str | None = None, argument: str = "ckp
         CheckpointError: the file is missing, damaged, no checkpoint of torchrefract, or of another task.
     """
     if not path.is_file():
-        raise CheckpointError(f"{argument} must be a checkpoint file, such as <run>/last.ckpt, got {path}")
+        names = " or ".join(model_names())
+        raise CheckpointError(
+            f"{argument} must be a checkpoint file, such as <run>/last.ckpt, or the name {names}, got {path}"
+        )
     try:
         with local_file(path) as file:
             checkpoint = read_weights(file) if path.suffix == WEIGHTS_SUFFIX else _read_archive(file)

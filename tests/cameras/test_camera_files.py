@@ -234,14 +234,15 @@ def test_a_long_recording_of_equal_messages_is_parsed_once(tmp_path):
 
 @pytest.mark.parametrize("ending", ["json", "xml", "yaml"])
 @pytest.mark.parametrize("lens", [(FIVE, "opencv"), (FISHEYE, "fisheye")])
-def test_files_that_opencv_writes_are_read(lens, ending, tmp_path, make_camera):
+@pytest.mark.parametrize("shape", [(-1, 1), (-1,)])  # the latter is an n-dimensional matrix of OpenCV 5
+def test_files_that_opencv_writes_are_read(shape, lens, ending, tmp_path, make_camera):
     path, (coefficients, model) = tmp_path / f"a.{ending}", lens
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     file.write("calibration_time", "Fri Nov 27 2026")
     for name, value in (("image_width", 640), ("image_height", 480), ("fisheye_model", int(model == "fisheye"))):
         file.write(name, value)
     file.write("camera_matrix", np.array(MATRIX))
-    file.write("distortion_coefficients", np.array([coefficients]).T)
+    file.write("distortion_coefficients", np.reshape(coefficients, shape))
     file.write("avg_reprojection_error", float("nan"))
     file.release()
     assert read_camera(path) == read_opencv(path) == make_camera(coefficients, model)

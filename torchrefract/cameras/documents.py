@@ -244,9 +244,10 @@ def _load_yaml(path: Path, text: str, form: str) -> Any:
                     raise yaml.constructor.ConstructorError(None, None, "found a merge key", key.start_mark)
             super().flatten_mapping(node)
 
-    Loader.add_constructor(
-        "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-    )
+    for kind in ("matrix", "nd-matrix"):  # OpenCV 5 writes the latter for arrays of one dimension
+        Loader.add_constructor(
+            f"tag:yaml.org,2002:opencv-{kind}", lambda loader, node: loader.construct_mapping(node, deep=True)
+        )
     try:
         return yaml.load(text, Loader=Loader)
     except (

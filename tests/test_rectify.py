@@ -72,6 +72,9 @@ def test_an_uncertain_camera_is_warned_of_and_crop_keeps_the_certain_part(call, 
     expected = rectified[top:, left:][: picture.shape[0], : picture.shape[1]]
     np.testing.assert_array_equal(picture, expected)
     assert read_opencv(folder / "cropped" / "camera.yaml").cx == 46.2 - left
+    (folder / "cropped" / "1.png").unlink()
+    again = call("rectify", "input=raw", "camera=cam.yaml", "crop=true", "out=cropped")
+    assert again.out.startswith("cropped: 1 rectified, 2 already existed, 0 skipped")
 
 
 def test_crop_leaves_no_black_border_of_a_pincushion_lens(call, folder):

@@ -4,6 +4,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -48,6 +49,7 @@ from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
     files_in,
+    image_header,
     is_lost,
     pixels_of,
     read_image,
@@ -304,6 +306,13 @@ def rectify(cfg: DictConfig) -> None:
         result = warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0]
         return result if part is None else part.of(result, camera.width)
 
+    def is_complete(file: Path, target: Path) -> bool:
+        if part is None or media.is_video(file):
+            return media.is_complete(file, target)
+        with suppress(UnreadableImageError):
+            return image_header(target).size == part.size(*image_header(file).size, camera.width)
+        return False
+
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
         return (pixels_of(rectify_frame(frame)) for frame in frames)
 
@@ -312,7 +321,7 @@ def rectify(cfg: DictConfig) -> None:
         for file in progress(files, "rectifying", count=len(files)):
             target = out / media.output_name(file).name
             try:
-                if media.is_complete(file, target):
+                if is_complete(file, target):
                     continue
                 with replace_file(target, alone=True) as path:
                     if media.is_video(file):

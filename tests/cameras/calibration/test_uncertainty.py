@@ -48,3 +48,16 @@ def test_the_certain_part_is_below_two_pixels_and_even():
     largest, part = certain_part(CAMERA, covariance(1e-3), PINHOLE)
     assert (largest < 2, part) == (True, Crop(0, 0, 800, 600))
     assert crop.of(torch.zeros(3, 300, 400), 800).shape[1:] == pytest.approx((crop.height / 2, crop.width / 2), abs=1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(300, 400), (400, 534), (450, 600), (1200, 1600), (720, 960)])
+def test_the_certain_part_of_frames_in_another_resolution_has_the_resized_camera_within_half_a_pixel(height, width):
+    _, crop = certain_part(CAMERA, covariance(), PINHOLE)
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    x, y = crop.of(torch.stack([x, y]), CAMERA.width)
+    shown, frame = PINHOLE.cropped(**crop._asdict()), PINHOLE.resized(height=height, width=width)
+    shown = shown.resized(height=x.shape[0], width=x.shape[1])  # raises for another shape
+    for j, i in ((0, 0), (-1, -1)):
+        (ray,) = frame.unproject(torch.stack([x[j, i], y[j, i]])[None].double()).points
+        pixel = torch.tensor([i % x.shape[1], j % x.shape[0]])
+        torch.testing.assert_close(shown.project(ray[None]).points[0], pixel.double(), atol=0.51, rtol=0)

@@ -57,11 +57,15 @@ class Crop(NamedTuple):
     width: int
     height: int
 
+    def size(self, height: int, width: int, frame_width: int) -> tuple[int, int]:
+        """Return the height and width of this part of a frame (height, width); both are even, which videos need."""
+        columns = 2 * round(self.width * width / frame_width / 2)
+        return 2 * round(columns * self.height / self.width / 2), columns
+
     def of(self, image: Tensor, frame_width: int) -> Tensor:
-        """Return this part of a frame (C, H, W) in any resolution; its sides are even, which videos need."""
-        scale = image.shape[2] / frame_width
-        left, top = round(self.left * scale), round(self.top * scale)
-        width, height = (int(side * scale) // 2 * 2 for side in (self.width, self.height))
+        """Return this part of a frame (C, H, W) in any resolution, around its middle as `Camera.resized` has it."""
+        height, width = self.size(*image.shape[1:], frame_width)
+        top, left = (image.shape[1] - height) // 2, (image.shape[2] - width) // 2
         return image[:, top : top + height, left : left + width]
 
 

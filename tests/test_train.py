@@ -229,6 +229,19 @@ def test_a_finished_run_cannot_be_resumed(call, trained):
     assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"
 
 
+@pytest.mark.parametrize(
+    ("word", "stored"), [("lr=0.02", "0.001"), ("weight_decay=0.5", "0.01"), ("schedule=plateau", "cosine")]
+)
+def test_a_resumed_run_keeps_its_optimizer(call, trained, word, stored):
+    path, (name, _, value) = trained.folder / "last.ckpt", word.partition("=")
+    words = (*trained.words, "trainer.max_epochs=3", f"ckpt_path={path}", "run_dir=run", f"model.{word}")
+    assert call("train", *words).message == (
+        f"model.{name} must be {stored}, as of the training that ckpt_path resumes, got {value}: init_from={path} "
+        "starts a new training with its weights"
+    )
+    assert not Path("run").exists()
+
+
 def test_a_new_training_does_not_replace_the_checkpoints_of_another_one(call, trained, tmp_path):
     shutil.copytree(trained.folder, tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}

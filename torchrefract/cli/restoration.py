@@ -64,6 +64,7 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
+    check_optimizer,
     check_run_folder,
     how_to_continue,
     load_model,
@@ -89,6 +90,8 @@ def train(cfg: DictConfig) -> None:
     if checkpoint is None:
         check_run_folder(as_path(cfg.run_dir))
     num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
+    if checkpoint:
+        check_optimizer(checkpoint, cfg.model, as_path(cfg.ckpt_path))
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:

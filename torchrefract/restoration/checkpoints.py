@@ -141,6 +141,20 @@ def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
     return int(checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
 
 
+def check_optimizer(checkpoint: Mapping[str, Any], config: Mapping[str, Any], path: Path) -> None:
+    """Raise CheckpointError if the configuration of a model states another optimizer than that of a checkpoint.
+
+    A resumed training continues with the learning rate, weight decay and schedule that the checkpoint holds.
+    """
+    stored = checkpoint.get("config", {}).get("model", {})
+    for name in ("lr", "weight_decay", "schedule"):
+        if name in stored and stored[name] != config.get(name, stored[name]):
+            raise CheckpointError(
+                f"model.{name} must be {stored[name]}, as of the training that ckpt_path resumes, got {config[name]}: "
+                f"init_from={path} starts a new training with its weights"
+            )
+
+
 class Loaded(NamedTuple):
     """A model and the facts about it that its checkpoint holds."""
 

@@ -299,6 +299,7 @@ def test_initial_weights_of_another_model_are_one_line_of_error(call, small, wor
         (("model.metric_size=[1080]",), "model: metric_size must be (height, width), got [1080]"),
         (("trainer.max_epochs=2.5",), "trainer: max_epochs must be a whole number, got 2.5"),
         (("trainer.accelerator=tpu",), "trainer: "),
+        (("+trainer.precision=bf16-true",), "trainer.precision must be one of 32-true, bf16-mixed, 16-mixed, since"),
         (("trainer.max_epochs=-1", "+trainer.max_time=00:00:00:05"), "schedule must be plateau "),
         (("hydra.run.dir=/dev/null/run",), "/dev/null/run could not be written: "),
     ],

@@ -64,7 +64,6 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
-    check_optimizer,
     check_run_folder,
     how_to_continue,
     load_model,
@@ -89,9 +88,7 @@ def train(cfg: DictConfig) -> None:
     data, model, trainer, checkpoint = _make_parts(cfg)
     if checkpoint is None:
         check_run_folder(as_path(cfg.run_dir))
-    num_epochs = num_epochs_done(checkpoint) if checkpoint else 0
-    if checkpoint:
-        check_optimizer(checkpoint, cfg.model, as_path(cfg.ckpt_path))
+    num_epochs = num_epochs_done(checkpoint, config=cfg.model, path=cfg.ckpt_path) if checkpoint else 0
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:

@@ -128,24 +128,21 @@ def check_run_folder(run: Path) -> None:
         )
 
 
-def num_epochs_done(checkpoint: Mapping[str, Any]) -> int:
+def num_epochs_done(checkpoint: Mapping[str, Any], *, config: Mapping[str, Any], path: str) -> int:
     """Return the number of complete epochs of a training checkpoint.
 
+    Args:
+        checkpoint: of `read_checkpoint`.
+        config: of the model of the training that resumes it, for messages with the `path` of the checkpoint.
+
     Raises:
-        CheckpointError: the checkpoint holds weights alone.
+        CheckpointError: the checkpoint holds weights alone, or another learning rate, weight decay or schedule than the
+            configuration, which the resumed training would ignore.
     """
     if "loops" not in checkpoint:
         raise CheckpointError(
             "ckpt_path must be a checkpoint of a training, such as <run>/last.ckpt, got weights alone"
         )
-    return int(checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
-
-
-def check_optimizer(checkpoint: Mapping[str, Any], config: Mapping[str, Any], path: Path) -> None:
-    """Raise CheckpointError if the configuration of a model states another optimizer than that of a checkpoint.
-
-    A resumed training continues with the learning rate, weight decay and schedule that the checkpoint holds.
-    """
     stored = checkpoint.get("config", {}).get("model", {})
     for name in ("lr", "weight_decay", "schedule"):
         if name in stored and stored[name] != config.get(name, stored[name]):
@@ -153,6 +150,7 @@ def check_optimizer(checkpoint: Mapping[str, Any], config: Mapping[str, Any], pa
                 f"model.{name} must be {stored[name]}, as of the training that ckpt_path resumes, got {config[name]}: "
                 f"init_from={path} starts a new training with its weights"
             )
+    return int(checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
 
 
 class Loaded(NamedTuple):

@@ -20,6 +20,7 @@ from torchrefract.types import Pair
 from torchrefract.warping.flow import resize_flow
 from torchrefract.warping.warp import warp
 
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 SCHEDULES = ("cosine", "plateau")
 
 
@@ -181,6 +182,14 @@ class RestorationModule(LightningModule, ABC):
             cosine = get_cosine_schedule_with_warmup(optimizer, self.num_warmup_steps(int(steps)), int(steps))
             scheduler = {"scheduler": cosine, "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    def setup(self, stage: str) -> None:
+        """Raise UsageError if the trainer would convert frames, flows and scores into another precision."""
+        if self.trainer.precision not in PRECISIONS and stage != "predict":
+            raise UsageError(
+                f"trainer.precision must be one of {', '.join(PRECISIONS)}, since frames, flows and scores need single "
+                f"precision, got {self.trainer.precision}"
+            )
 
     def on_fit_start(self) -> None:
         """Keep the seed of the run."""

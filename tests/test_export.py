@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrefract import warp
 from torchrefract.restoration import export
 from torchrefract.restoration.checkpoints import load_model
+from torchrefract.restoration.models.lens_net import LensEncoder
 
 SIZE = (40, 72)  # of the frames
 MODEL_SIZE = (32, 64)  # of the training, and of the frames if no size is given
@@ -63,6 +64,16 @@ def test_an_onnx_program_computes_the_model_for_frames_of_the_training_and_any_b
     (about,) = onnx.load(out).metadata_props
     metadata = json.loads(about.value)
     assert (metadata["task"], metadata["licenses"], metadata["outputs"]) == ("deweather", {"data": "CC0"}, ["restored"])
+
+
+def test_an_onnx_program_computes_the_features_of_lens_net(tmp_path, oracle):
+    network, names = LensEncoder(weightings=1, lenses=2, edges=64).eval(), ["features", "cells"]
+    path, program = tmp_path / "model.onnx", export.trace(network, images(2, SIZE))
+    export.save_program(program, path, outputs=names, metadata={})
+    for name, output, value in zip(
+        names, export.load_program(path)(images(1, SIZE)), network(images(1, SIZE)), strict=True
+    ):
+        oracle(f"exported .onnx, lens_net, {name}", output, value.detach(), 1e-4)
 
 
 @pytest.mark.parametrize("package", ["onnxscript", "onnxruntime"])

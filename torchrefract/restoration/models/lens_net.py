@@ -174,8 +174,8 @@ def concentration(edges: Edges, weights: Tensor, strength: float) -> Tensor:
     """
     with torch.no_grad():  # positions of edges have no parameters
         angle, offset = undistorted_lines(edges, strength)
-        row = (angle / _ANGLE_BIN).clamp(0, _NUM_ANGLES - 1e-3)
-        column = (offset / _OFFSET_BIN + _NUM_OFFSETS / 2).clamp(0, _NUM_OFFSETS - 1e-3)
+        row = (angle / _ANGLE_BIN).clamp(0.0, _NUM_ANGLES - 1e-3)
+        column = (offset / _OFFSET_BIN + _NUM_OFFSETS / 2).clamp(0.0, _NUM_OFFSETS - 1e-3)
         first = row.floor() * (_NUM_OFFSETS + 1) + column.floor()
         down, right = row.frac(), column.frac()
         corners = torch.cat([first, first + 1, first + _NUM_OFFSETS + 1, first + _NUM_OFFSETS + 2], dim=1).long()

@@ -115,3 +115,4 @@ def test_pictures_of_two_sizes_and_a_checkpoint_of_another_task_are_errors(call,
     cv2.imwrite(str(folder / "raw" / "9.png"), np.zeros((40, 60, 3), np.uint8))
     message = call("estimate_lens", "input=raw").message
     assert message.startswith("input: frames must be of one size, since they are of one camera, got 480 x 270 px and")
+    assert message.endswith("in raw/9.png, 60 x 40 px")

@@ -102,7 +102,7 @@ def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, l
 
 def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> Iterator[Tensor]:
     """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
-    num_read, reason = 0, ""
+    num_read, reason, size = 0, "", None
     for file, times in chosen:
         num_before = num_read
         try:
@@ -111,6 +111,13 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             else:
                 frames = (read_image(file, upright=upright)[None] for _ in times)
             for frame in frames:
+                height, width = frame.shape[2:]
+                if size not in (None, (width, height)):
+                    raise ValueError(
+                        f"frames must be of one size, since they are of one camera, got {size[0]} x {size[1]} px and, "
+                        f"in {file}, {width} x {height} px"
+                    )
+                size = width, height
                 yield frame
                 num_read += 1
             if times and num_read == num_before:

@@ -474,6 +474,21 @@ def test_frames_for_training_carry_their_depth(tmp_path):
     assert pair.transmission[0, 0, 10, 0] > pair.transmission[2, 0, 10, 0] > 0
 
 
+@pytest.mark.parametrize("command", ["train", "degrade", "generate"])
+def test_a_map_that_is_not_in_meters_is_named_in_one_line_of_error(call, small, tmp_path, command):
+    for path in write_frames(tmp_path):
+        target = tmp_path / "depth" / path.relative_to(tmp_path / "frames").with_suffix(".npy")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        np.save(target, np.linspace(math.nan if path.stem == "a" else 50, 5, 56 * 84).reshape(56, 84))
+    words = ["scene=cape_town_fog", "source=frames", "depth=depth", "workers=0", "out=out"]
+    words += ["license=CC0"] if command == "generate" else []
+    if command == "train":  # a worker reads the maps
+        words = ["+task=deweather", *(word for word in small if "count" not in word), "data=frames", "data.root=frames"]
+        words += ["data.depth=depth", "data.workers=1", "data.batch_size=1", "data.val_share=0.34"]
+    message = call(command, *words).message
+    assert message == "depth/a.npy: depth must be at least 0, in m, got nan"
+
+
 def test_a_missing_library_is_named(call, tmp_path, monkeypatch):
     write_frames(tmp_path)
     monkeypatch.setitem(sys.modules, "transformers", None)

@@ -341,7 +341,7 @@ def _user_message(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
-    if isinstance(error, FILE_ERRORS):
+    if isinstance(error, FILE_ERRORS) or str(error).startswith("Caught UsageError in DataLoader worker"):
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))

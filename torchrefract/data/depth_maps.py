@@ -131,14 +131,11 @@ def read_depth(path: Path, *, scale: float = STEP) -> tuple[Tensor, float]:
     return torch.from_numpy(depth), missing
 
 
-def crop_depth(
-    depth: Tensor, frame_size: tuple[int, int], size: tuple[int, int] | None, *, name: str = "depth"
-) -> Tensor:
+def crop_depth(depth: Tensor, frame_size: tuple[int, int], size: tuple[int, int] | None, *, name: str) -> Tensor:
     """Return a map (H', W') as (1, h, w), cropped and reduced like its frame of `frame_size`.
 
     Raises:
-        UsageError: the map has not the shape of the frame.
-        ValueError: it is not in m, see `check_depth`.
+        UsageError: the map, of the file `name`, has not the shape of the frame, or is not in m, see `check_depth`.
     """
     (height, width), (rows, columns) = frame_size, depth.shape
     if 2 * abs(rows * width - columns * height) > max(height, width):
@@ -146,7 +143,10 @@ def crop_depth(
             f"depth must be of the size of the picture, {height}x{width} (height x width), or of its shape, "
             f"got {rows}x{columns} in {name}"
         )
-    check_depth(depth[None, None])
+    try:
+        check_depth(depth[None, None])
+    except ValueError as error:
+        raise UsageError(f"{name}: {error}") from error
     # Crop and reduce a picture of relative coordinates like the image, and sample the depth at the results: an average
     # over the edge of an object would be a distance at which there is nothing.
     position = torch.zeros(3, height, width)

@@ -157,7 +157,8 @@ def test_a_stopped_or_killed_run_continues_to_the_end_of_an_uninterrupted_one(ca
     before = metrics(run, "val/loss")
     for name in (".last.part.ckpt", ".best-0123abcd.ckpt"):
         (run / name).touch()
-    assert call("train", *words, f"ckpt_path={last}").code == 0
+    outcome = call("train", *words, f"ckpt_path={last}")
+    assert (outcome.code, outcome.err) == (0, "")
     assert metrics(run, "val/loss", file="metrics_before.csv") == before
     assert sorted(metrics(run, "val/loss")) == [1]
     assert not list(run.glob(".*"))
@@ -240,6 +241,13 @@ def test_a_resumed_run_keeps_its_optimizer(call, trained, word, stored):
         "starts a new training with its weights"
     )
     assert not Path("run").exists()
+
+
+def test_a_resumed_run_warns_of_other_values(call, trained):
+    words = (f"ckpt_path={trained.folder / 'last.ckpt'}", "trainer.max_epochs=3", "data.val_count=2", "run_dir=run")
+    outcome = call("train", *trained.words, *words)
+    assert outcome.code == 0
+    assert outcome.err == "warning: the training continues with other values than before of data.val_count\n"
 
 
 def test_a_new_training_does_not_replace_the_checkpoints_of_another_one(call, trained, tmp_path):

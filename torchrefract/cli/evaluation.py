@@ -82,6 +82,14 @@ def use_validation_config(
         if "effect" in cfg.data:
             cfg.data.effect = cfg.scene
         cfg.model.task = cfg.task
+    return changed_values(cfg, checkpoint)
+
+
+def changed_values(cfg: DictConfig, checkpoint: dict[str, Any]) -> list[str]:
+    """Return the names of the values of data and model that differ from those of a checkpoint's configuration."""
+    stored = checkpoint.get("config")
+    if not (isinstance(stored, dict) and all(isinstance(stored.get(part), dict) for part in ("data", "model"))):
+        return []
     before, after = map(_compared, (stored, cast(Any, OmegaConf.to_container(cfg))))
     return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
 

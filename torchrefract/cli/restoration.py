@@ -25,7 +25,7 @@ from torchrefract._io import as_path, file_digest, make_folder, matching_files, 
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, print_warning, progress
-from torchrefract.cli.evaluation import describe_validation, use_validation_config
+from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.cli.options import (
     check_seed,
@@ -93,6 +93,8 @@ def train(cfg: DictConfig) -> None:
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
+    if checkpoint and (changed := changed_values(cfg, checkpoint)):
+        print_warning(f"the training continues with other values than before of {', '.join(changed)}")
     initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
     licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)
     model.origin = _origin(cfg, data, initial_licenses=licenses)

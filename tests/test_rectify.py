@@ -247,6 +247,10 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(ca
             ("input=raw", "camera=short.yaml"),
             "camera: path must hold 4 x 1 numbers as distortion_coefficients, got short.yaml with 3",
         ),
+        (
+            ("input=raw", "camera=k4.xml"),
+            "camera must be of the model opencv or fisheye for this file (convert(camera, to",
+        ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom must be a number in [0.05, 20], got 0"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (
@@ -259,6 +263,8 @@ def test_invalid_options_are_one_line_of_error(call, folder, options, message):
     (folder / "bad.yaml").write_text("no camera")
     text = (folder / "cam.yaml").read_text()
     (folder / "short.yaml").write_text(text.rsplit(",", 1)[0] + " ]\n")
+    sides = "<width>96</width><height>64</height><f>70</f>"
+    (folder / "k4.xml").write_text(f"<calibration><projection>frame</projection>{sides}<k4>0.001</k4></calibration>")
     cv2.imwrite(str(folder / "wide.png"), np.zeros((10, 90, 3), np.uint8))
     outcome = call("rectify", *options)
     assert outcome.code == 1

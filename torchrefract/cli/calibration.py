@@ -363,7 +363,10 @@ def _part_to_keep(
 def _write_camera(path: Path, camera: Camera) -> None:
     """Write a camera unless the file holds it already; raise UsageError if it holds another one."""
     if not path.is_file():
-        write_opencv(path, camera)
+        try:
+            write_opencv(path, camera)
+        except ValueError as error:  # a polynomial of Metashape with k4
+            raise UsageError(str(error)) from error
         return
     with naming("out"):
         existing = read_opencv(path)

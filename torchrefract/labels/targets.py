@@ -117,9 +117,10 @@ def warp_labels(
     return _warp_target(target, flow, _Options(*limits, soft_masks, mask_fill, padding, interpolation))
 
 
-def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default") -> Any:
+def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default", *, mask_fill: float = 0) -> Any:
     """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged: neither clipped nor dropped."""
-    return _warp_target(target, flow, _Options(keep_unmoved=True, labels_getter=check_labels_getter(labels_getter)))
+    options = _Options(keep_unmoved=True, labels_getter=check_labels_getter(labels_getter), mask_fill=mask_fill)
+    return _warp_target(target, flow, options)
 
 
 def check_labels_getter(labels_getter: Any) -> Any:

@@ -81,6 +81,21 @@ def test_a_picture_is_degraded_with_the_numbers_of_the_camera_file(call, folder)
     assert (written - expected[0]).abs().max() < 0.51 / 255 + 1e-5
 
 
+@pytest.mark.parametrize("command", ["degrade", "generate"])
+@pytest.mark.parametrize(
+    "camera", ["camera.yaml", "{_target_: torchrefract.cameras.io.read_camera, path: camera.yaml}"]
+)
+def test_a_folder_is_not_continued_with_another_camera_in_the_file_of_the_scene(call, folder, command, camera):
+    scene = f"_target_: torchrefract.presets.cape_town_fog\nseverity: 3\ncamera: {camera}\n"
+    (folder / "conf" / "scene").mkdir(parents=True)
+    (folder / "conf" / "scene" / "mine.yaml").write_text(scene)
+    for width, code in ((64, 0), (64, 0), (128, 1)):
+        write_camera(folder / "camera.yaml", 3 * width // 4, width)
+        outcome = call(command, "--config-dir", "conf", *COMMANDS[command], "scene=mine", "out=out")
+        assert outcome.code == code, outcome.err
+    assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
+
+
 def test_cropped_frames_have_a_cropped_camera(call, folder):
     options = (*COMMANDS["generate"], FOG, *PLACE, "size=[20,40]", "out=out")
     assert call("generate", *options).code == 0

@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
@@ -356,7 +357,7 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
     return {
         "source": str(root.resolve()),
         "scene": scene,
-        "files": file_digests(scene.values()),  # as that of a camera
+        "files": file_digests(pytree.tree_leaves(scene)),  # as that of a camera
         "width": "of each file" if job.has_width else None,
         "seed": job.seed,
         "drives": job.shots and hashlib.sha256(repr(sorted(job.shots.items())).encode()).hexdigest(),

@@ -31,6 +31,7 @@ _SAMPLES_PER_EDGE = 64
 _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible", "keypoint_visibility")
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
+_OF_IMAGE += ("_shape", "canvas", "resolution", "scale_factor", "ratio_pad")
 
 
 class _Options(NamedTuple):

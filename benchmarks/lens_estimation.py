@@ -17,13 +17,13 @@ the pixels of the rectified frame. Both rectified frames have their principal po
 over the draws. "rectified" rows are the same frames after `rectify` by the calibrated camera: their lens is none.
 "lines" is the distance of corners of one row or column from a straight line, px rms, before and after.
 
---drives degrades the frames of FRAMES/val by `cheap_dashcam`, as a validation of the task undistort does, and estimates
-the flow of each frame alone, by straight edges: the mean of the flows of 256 lenses that the effect draws, weighted by
-their likelihood. "constant" is their mean without weights. For "both" they are weighted also by a normal distribution
-around the flow of the network, of 20 px. --pool sees all frames of a drive through one lens, as a camera does, each
-drive through up to four lenses in turn, and estimates it from all of them: the likelihoods of 2,048 lenses, and the
-mean flow of the network. --wide takes the wide lens of Table 1 instead. --without leaves out frames whose own lens
-shows, by the beginnings of their names.
+--drives degrades each frame of FRAMES/val by four lenses of `cheap_dashcam` in turn, the first that of a validation of
+the task undistort, and estimates the flow of each picture alone, by straight edges: the mean of the flows of 256 lenses
+that the effect draws, weighted by their likelihood. "constant" is their mean without weights. For "both" they are
+weighted also by a normal distribution around the flow of the network, of 20 px. --pool sees all frames of a drive
+through one lens, as a camera does, each drive through four lenses in turn, and estimates it from all of them: the
+likelihoods of 2,048 lenses, and the mean flow of the network. --wide takes the wide lens of Table 1 instead. --without
+leaves out frames whose own lens shows, by the beginnings of their names.
 
 --clip writes a video of that many frames, which pan over a rendered road behind a lens that stays, and restores it
 frame by frame and with `pool=lens`. "jitter" is the mean change of the flow from a frame to the next, px of a frame
@@ -91,7 +91,7 @@ _POOLS = {1: 7, 5: 5, 20: 3}  # number of draws by the number of frames
 _WIDTH = 1920  # px, of errors
 _GRID = 41
 _NUM_LENSES, _FLOW_STRIDE = 256, 8  # of the prior of single frames; px
-_NUM_POOLED_LENSES, _NUM_DRAWS = 2048, 4  # of the prior of drives; lenses that each drive is seen through
+_NUM_POOLED_LENSES, _NUM_DRAWS = 2048, 4  # of the prior of drives; lenses that each frame or drive is seen through
 _NETWORK_PX = 20  # px at 1920, standard deviation of the flow of a network: 1.25 times its mean error of 16 px
 _PRIOR_SEED = 123  # another one than that of the frames
 
@@ -308,8 +308,9 @@ def held_out(
             name = frames.drive_names[i] if pool else path.relative_to(root).as_posix()
             groups.setdefault(name, []).append(i)
     for name, members in groups.items():
-        for key in [frames.keys[i] for i in members[:_NUM_DRAWS]]:  # a frame alone has the draw of a validation
-            pairs = [effect.degrade(frames[i].image[None], seed=0, keys=[key]) for i in members]
+        for seed in range(_NUM_DRAWS):  # with seed 0, a frame alone has the draw of a validation
+            draw: dict[str, Any] = {"seed": seed, "keys": [frames.keys[members[0]]]}
+            pairs = [effect.degrade(frames[i].image[None], **draw) for i in members]
             true = sparse(pairs[0].restore_flow)[0]
             costs = costs_of_lenses([to_gray(pair.image[0]) for pair in pairs], prior)
             flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(costs, prior)}
@@ -321,8 +322,12 @@ def held_out(
             error = {kind: scale * (flow - true).norm(dim=0).mean().item() for kind, flow in flows.items()}
             rows.append({"frame": name, **error})
     means = {kind: sum(row[kind] for row in rows) / len(rows) for kind in rows[0] if kind != "frame"}
-    unit = f"lenses of {len(groups)} drives" if pool else "frames"
-    print(f"{len(rows)} {unit}", *(f"{kind} {value:.2f}" for kind, value in means.items()), sep="  ")
+    unit = "drives" if pool else "frames"
+    print(
+        f"{len(rows)} lenses of {len(groups)} {unit}",
+        *(f"{kind} {value:.2f}" for kind, value in means.items()),
+        sep="  ",
+    )
     return rows
 
 

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from statistics import fmean
 
 import cv2
 import lens_estimation
@@ -86,13 +87,16 @@ def test_held_out_frames_leave_out_drives_whose_lens_shows(tmp_path, monkeypatch
         (tmp_path / name).parent.mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / name), poles(144, 256))
     rows = lens_estimation.held_out(tmp_path, (144, 256), without=("bent_",))
-    assert [row["frame"] for row in rows] == ["val/b_1.png"]
-    assert rows[0]["lines"] < 0.5 * min(rows[0]["constant"], rows[0]["nothing"])
-    assert "1 frames" in capsys.readouterr().out
+    assert [row["frame"] for row in rows] == ["val/b_1.png"] * 4
+    assert len({row["nothing"] for row in rows}) == 4  # lenses
+    lines, constant, nothing = (fmean(row[kind] for row in rows) for kind in ("lines", "constant", "nothing"))
+    assert lines < 0.5 * min(constant, nothing)
+    assert "4 lenses of 1 frames" in capsys.readouterr().out
 
 
 def test_a_network_that_is_right_improves_on_the_lines_of_a_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 32)
+    monkeypatch.setattr(lens_estimation, "_NUM_DRAWS", 1)
     for name in ("train/a_1.png", "val/b_1.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / name), np.zeros((144, 256, 3), np.uint8))  # no lines
@@ -113,9 +117,10 @@ def test_pooled_frames_of_a_drive_have_one_lens_and_tell_more_of_it(tmp_path, mo
         cv2.imwrite(str(tmp_path / name), picture)
     alone = lens_estimation.held_out(tmp_path, (144, 256))
     pooled = lens_estimation.held_out(tmp_path, (144, 256), pool=True)
-    assert [row["frame"] for row in pooled] == ["b", "b"]
-    # The first is seen through the lens of the first frame alone, in whose picture the other one adds nothing.
-    assert pooled[0]["nothing"] == pytest.approx(alone[0]["nothing"])
-    assert pooled[0]["lines"] == pytest.approx(alone[0]["lines"], rel=0.05)
-    assert pooled[1]["lines"] < 0.5 * alone[1]["lines"]
-    assert "2 lenses of 1 drives" in capsys.readouterr().out
+    assert [row["frame"] for row in pooled] == ["b"] * 4
+    # The drive is seen through the lenses of its first frame, to whose picture the other one adds nothing.
+    for together, first in zip(pooled, alone[:4], strict=True):
+        assert together["nothing"] == pytest.approx(first["nothing"])
+        assert together["lines"] == pytest.approx(first["lines"], rel=0.05)
+    assert fmean(row["lines"] for row in pooled) < 0.5 * fmean(row["lines"] for row in alone[4:])
+    assert "4 lenses of 1 drives" in capsys.readouterr().out

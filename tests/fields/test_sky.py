@@ -43,6 +43,19 @@ def test_sky_that_only_corners_connect_to_the_top_row_is_found():
     assert (sky_mask(frame) & expected).sum() > 0.85 * expected.sum()
 
 
+@pytest.mark.parametrize(("share", "is_sky"), [(0.5, True), (0.02, False)])
+def test_blue_below_a_cloud_is_sky_if_more_of_the_sky_is_blue_and_else_glass(share, is_sky):
+    frame, _ = painted((0.45, 0.55, 0.7))
+    cloud = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    cloud[:20] = True
+    cloud[:, round((1 - share) * WIDTH) :] = False  # blue, down to the trees
+    cloud[20:40, 92:] = True  # a tree, which cuts off what is below the cloud
+    frame[0, :, cloud] = 0.9
+    frame[0, :, 20:40, 92:] = 0.1 + 0.4 * torch.rand(3, 20, WIDTH - 92, generator=torch.Generator().manual_seed(3))
+    part = sky_mask(frame)[:, :, 22:39, :59].float().mean()
+    assert part > 0.95 if is_sky else part < 0.05
+
+
 @pytest.mark.parametrize("name", ["road from above", "night", "trees", "black", "white", "one pixel"])
 def test_frames_without_sky_have_none(name):
     frame, _ = painted()

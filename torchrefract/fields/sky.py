@@ -18,6 +18,7 @@ _MIN_LUMA, _ABOVE_MEDIAN = 0.5, 0.05  # of a gray or white sky; streets at night
 _MIN_BLUE, _MIN_BLUE_LUMA = 0.1, 0.3  # blue minus red, and luma, of a blue sky
 _MIN_CONTRAST = 0.15  # of the mean luma of a gray or white sky to that of the rest; that of a road is below 0.1
 _MIN_SHARE = 0.02  # of the frame
+_MIN_BLUE_SHARE = 0.05  # of the sky; below, the blue is glass that mirrors it
 _MAX_NIGHT_LUMA, _MIN_NIGHT_SHARE = 0.3, 0.05  # of a sky at night
 _AROUND, _MAX_DARKER = 15, 0.12  # nodes, and difference of a channel, from the color of the sky around a pixel
 _GROWTHS, _MAX_DIFFERENCE = 3, 0.06  # steps, and difference of a channel, from the sky around to more of it
@@ -72,10 +73,11 @@ def sky_mask(image: Tensor) -> Tensor:
     lies within 0.06, and if its luma is above 0.5 and 0.05 above the median, or if blue exceeds red by 0.1 and the luma
     0.3. The candidates that are connected to the top row are the sky, if they cover 2 % of the frame and are blue or,
     in the mean, 0.15 brighter than the rest. So a road seen from above, a frame at night and a frame without sky have
-    none. Three times, nodes join it that are smooth and, in each channel, within 0.06 of the sky at most 7 nodes away:
-    this finds the haze at the horizon, and sky that poles cut off. A pixel at these nodes, next to them, or above them
-    in its column is then sky unless one of its channels is darker by 0.12 than the sky around it: this follows trees
-    and poles, and fills clouds.
+    none. Three times, smooth nodes at most 7 nodes from the sky join it: those that differ from it there by less than
+    0.06 in each channel, which finds the haze at the horizon, and sky that poles cut off; and, if 5 % of the sky are
+    blue, those of a paler blue, which finds blue sky that clouds cut off. A pixel at these nodes, next to them, or
+    above them in its column is then sky unless one of its channels is darker by 0.12 than the sky around it: this
+    follows trees and poles, and fills clouds.
 
     Args:
         image: (N, C, H, W), stored values (sRGB) in [0, 1], or uint8. Three channels are red, green and blue; other
@@ -87,10 +89,11 @@ def sky_mask(image: Tensor) -> Tensor:
     image = image.detach()
     mask, stride, _ = find_sky(image)
     nodes = _nodes(image, stride)
-    is_smooth = _is_smooth(luma(nodes))
+    is_smooth, is_pale = _is_smooth(luma(nodes)), _is_pale(nodes, mask)
     for _ in range(_GROWTHS):
         nearby, is_near = _mean_nearby(mask, nodes)
-        mask = mask | is_near & is_smooth & ((nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE)
+        is_equal = (nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE
+        mask = mask | is_near & is_smooth & (is_equal | is_pale)
     nearby, is_near = _mean_nearby(mask, nodes)
     color, weight = torch.where(is_near, nearby, _mean_where(mask, nodes)), mask.float()
     color = torch.where(mask, torch.minimum(color, nodes), color)  # of blue sky between white clouds
@@ -108,7 +111,7 @@ def find_sky(image: Tensor) -> Sky:
     stride = max(1, max(image.shape[2:]) // _NODES)
     nodes = _nodes(image.detach(), stride)
     y = luma(nodes)
-    blue = nodes[:, 2:] - nodes[:, :1] if image.shape[1] == 3 else torch.zeros_like(y)
+    blue = _blue(nodes)
     is_smooth = _is_smooth(y)
     median = y.flatten(1).median(dim=1).values.view(-1, 1, 1, 1)
     is_bright = y > (median + _ABOVE_MEDIAN).clamp(min=_MIN_LUMA)
@@ -145,6 +148,20 @@ def _nodes(image: Tensor, stride: int) -> Tensor:
     nodes = image[:, :, ::stride, ::stride]
     nodes = nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()
     return nodes.contiguous().nan_to_num(nan=0.0).clamp(0, 1)
+
+
+def _blue(nodes: Tensor) -> Tensor:
+    """Return blue minus red, (N, 1, h, w), and 0 for an image that has no three channels."""
+    return nodes[:, 2:] - nodes[:, :1] if nodes.shape[1] == 3 else torch.zeros_like(nodes[:, :1])
+
+
+def _is_pale(nodes: Tensor, sky: Tensor) -> Tensor:
+    """Return the nodes with a blue between that of the sky and white; none, if little of the sky is blue."""
+    y, blue = luma(nodes), _blue(nodes)
+    is_blue = blue > _MIN_BLUE
+    blue_sky = sky & is_blue
+    is_pale = (y > _mean_where(blue_sky, y) - _MAX_DIFFERENCE) & (blue < _mean_where(blue_sky, blue) + _MAX_DIFFERENCE)
+    return is_blue & is_pale & (_share(blue_sky) > _MIN_BLUE_SHARE * _share(sky))
 
 
 def _connected_to_top(candidate: Tensor) -> Tensor:

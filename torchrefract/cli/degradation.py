@@ -283,7 +283,7 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
             if not _is_complete(task, job, stored)
             or (isinstance(labels, CocoLabels) and task.labels and task.name not in finished)
         ]
-        _warn([task.file for task in missing], tasks, labels)
+        _warn([task.file for task in missing], tasks, labels, has_camera=cfg.scene.get("camera") is not None)
         _degrade_missing(missing, job, workers=min(workers, len(missing)), names=names)
         if isinstance(labels, CocoLabels):
             moved = dict(_read_journal(out))
@@ -383,12 +383,13 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
     }
 
 
-def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None) -> None:
+def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None, *, has_camera: bool) -> None:
     if missing and is_remote(missing[0]):  # the header of each file would cost a request for all of it
         missing = missing[:: len(missing) // _SAMPLES or 1]
     messages = media.describe_losses(missing, upright=True)
-    if labels:
+    if labels or has_camera:
         messages.append(media.describe_turned(missing, upright=True))
+    if labels:
         without = [t.name for t in tasks if not t.labels and (media.is_video(t.file) or isinstance(labels, CocoLabels))]
         messages.append(f"labels do not list {len(without)} of the files: {first_names(without)}" if without else "")
     for message in filter(None, messages):

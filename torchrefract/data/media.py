@@ -153,7 +153,7 @@ def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
     if not turned:
         return ""
     use = (
-        "They are read as displayed, and so labels must be of the displayed pictures"
+        "They are read as displayed, and so labels and a camera must be of the displayed pictures"
         if upright
         else "Their pixels are used as stored, since a camera's geometry holds in that frame"
     )

@@ -127,6 +127,18 @@ def test_displacements_scale_with_the_width_of_each_picture_unless_a_width_is_gi
             assert (flow - expected.flow[0]).abs()[:, valid].max() < 0.01
 
 
+def test_flows_beyond_the_range_of_a_png_are_warned_of(call, folder):
+    write(folder / "raw" / "a" / "wide.png", picture(32, 4000))
+    (folder / "conf" / "scene").mkdir(parents=True)
+    scene = "_target_: torchrefract.LensDistortion\nk1_range: [-0.9, -0.9]\nframe: pad\n"
+    (folder / "conf" / "scene" / "mine.yaml").write_text(scene)
+    for maps, is_warned in (("png", True), ("npz", False)):
+        words = ("--config-dir", "conf", "source=raw/a", f"out={maps}", "scene=mine", f"maps={maps}", "workers=0")
+        outcome = call("degrade", *words)
+        assert outcome.code == 0, outcome.err
+        assert ("the flows of wide.png exceed 512 px, the range of a PNG" in outcome.err) == is_warned
+
+
 def test_maps_are_those_of_the_effect(call, folder):
     words = ("source=raw", "out=out", "scene=paper_weather", "workers=0", "maps=npz")
     assert call("degrade", *words).code == 0

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrefract._io import as_path, replace_file
+from torchrefract._io import as_path, replace_file, write_file
 
 
 def test_the_old_file_stays_until_the_new_one_is_complete(tmp_path):
@@ -33,6 +33,11 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_report_may_hold_names_of_files_that_are_no_unicode(tmp_path):
+    write_file(tmp_path / "report.html", "Zürich/\udcff.png")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == "Zürich/\\udcff.png"
 
 
 def test_a_block_that_writes_nothing_raises(tmp_path):

@@ -188,9 +188,12 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: str | bytes, *, alone: bool = False) -> None:
-    """Replace a file by a text in UTF-8, or by bytes; see `replace_file`."""
+    """Replace a file by a text in UTF-8, with bytes of names that are no Unicode escaped, or by bytes.
+
+    See `replace_file`.
+    """
     with replace_file(path, alone=alone) as temporary:
         if isinstance(content, str):
-            temporary.write_text(content, encoding="utf-8")
+            temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
         else:
             temporary.write_bytes(content)

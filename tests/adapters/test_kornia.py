@@ -64,6 +64,21 @@ def test_labels_follow_a_depth_that_is_computed_from_the_image():
         other(points, params=container._params, data_keys=["keypoints"])
 
 
+def test_frames_of_a_clip_share_a_draw_that_their_labels_follow():
+    effect = LensDistortion(k1_range=(-0.4, 0.3))
+    clips = K.VideoSequential(adapter.KorniaEffect(effect), data_format="BTCHW", same_on_frame=True)
+    container = K.AugmentationSequential(clips, data_keys=["input", "mask", "keypoints"])
+    image, soft, points, *_ = inputs()
+    frames, masks, moved = container(*(value[:, None].repeat_interleave(3, dim=1) for value in (image, soft, points)))
+    params = container._params[0].data[0].data
+    degraded = effect.degrade(image, seed=params["seed"][:1], keys=params["keys"][::3])
+    assert not torch.equal(degraded.flow[0], degraded.flow[1])
+    for t in range(3):
+        assert_close(frames[:, t], degraded.image)
+        assert ((masks[:, t] - warp_mask(soft, degraded.flow)).abs() > 1e-3).float().mean() < 1e-3
+        assert_close(moved[:, t], warp_points(points, degraded.flow)[0], rtol=0, atol=1e-3)
+
+
 def test_without_kornia_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "kornia.constants", None)
     monkeypatch.delitem(sys.modules, adapter.__name__)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from PIL import Image
 
 from torchrefract import presets
 from torchrefract.cameras.camera import Camera
@@ -79,6 +80,32 @@ def test_a_picture_is_degraded_with_the_numbers_of_the_camera_file(call, folder)
     expected = fog.degrade(image, seed=0, keys=[key_of("a.png")]).image
     written = read_image(folder / "out" / "a.png")
     assert (written - expected[0]).abs().max() < 0.51 / 255 + 1e-5
+
+
+@pytest.mark.parametrize("command", ["degrade", "generate"])
+@pytest.mark.parametrize(
+    "camera", ["camera.yaml", "{_target_: torchrefract.cameras.io.read_camera, path: camera.yaml}"]
+)
+def test_a_folder_is_not_continued_with_another_camera_in_the_file_of_the_scene(call, folder, command, camera):
+    scene = f"_target_: torchrefract.presets.cape_town_fog\nseverity: 3\ncamera: {camera}\n"
+    (folder / "conf" / "scene").mkdir(parents=True)
+    (folder / "conf" / "scene" / "mine.yaml").write_text(scene)
+    for width, code in ((64, 0), (64, 0), (128, 1)):
+        write_camera(folder / "camera.yaml", 3 * width // 4, width)
+        outcome = call(command, "--config-dir", "conf", *COMMANDS[command], "scene=mine", "out=out")
+        assert outcome.code == code, outcome.err
+    assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
+
+
+def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder):
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGB", (64, 48)).save(folder / "frames" / "c.jpg", exif=exif)
+    warning = "c.jpg. They are read as displayed, and so labels and a camera must be of the displayed pictures"
+    for name, words in (("with", PLACE[:1]), ("without", ())):
+        outcome = call("degrade", *COMMANDS["degrade"], FOG, *words, f"out={name}")
+        assert outcome.code == 0, outcome.err
+        assert (warning in outcome.err) == bool(words)
 
 
 def test_cropped_frames_have_a_cropped_camera(call, folder):

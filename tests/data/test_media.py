@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from av.codec.context import Flags
-from PIL import Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import FrameFolder
@@ -412,6 +412,32 @@ def test_a_picture_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_path,
             assert np.abs(np.asarray(ImageOps.exif_transpose(written)).astype(float) - displayed).mean() < 4
         assert is_complete(source, target)
     assert bool(describe_turned([source])) == (orientation != 1)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_the_thumbnail_of_the_source_which_shows_other_pixels_is_not_kept(tmp_path, upright, order):
+    def directory(entries: list[tuple[int, int, int]], following: int) -> bytes:
+        """Return entries of a tag, its type (3 of 2 bytes, 4 of 4 bytes) and its value, and the next offset."""
+        rows = [
+            (tag.to_bytes(2, order), kind, value.to_bytes(2 if kind == 3 else 4, order)) for tag, kind, value in entries
+        ]
+        texts = [
+            tag + kind.to_bytes(2, order) + (1).to_bytes(4, order) + value.ljust(4, b"\0") for tag, kind, value in rows
+        ]
+        return len(rows).to_bytes(2, order) + b"".join(texts) + following.to_bytes(4, order)
+
+    thumbnail = io.BytesIO()
+    Image.fromarray(page()).resize((16, 12)).save(thumbnail, "jpeg")
+    head = (b"II" if order == "little" else b"MM") + (42).to_bytes(2, order) + (8).to_bytes(4, order)
+    of_thumbnail = [(0x0103, 3, 6), (0x0201, 4, 68), (0x0202, 4, len(thumbnail.getvalue()))]
+    exif = head + directory([(0x0112, 3, 6)], 26) + directory(of_thumbnail, 0) + thumbnail.getvalue()
+    source, target = tmp_path / "a.jpg", tmp_path / "b.jpg"
+    Image.fromarray(page()).save(source, exif=b"Exif\0\0" + exif)
+    assert load(source).getexif().get_ifd(ExifTags.IFD.IFD1)[0x0201] == 68
+    write_picture(read_image(source, upright=upright), target, source=source, upright=upright)
+    assert load(target).getexif()[0x0112] == (1 if upright else 6)
+    assert not load(target).getexif().get_ifd(ExifTags.IFD.IFD1)
 
 
 def test_exif_data_behind_the_pixels_of_a_png_turn_it(tmp_path):

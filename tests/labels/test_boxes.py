@@ -47,6 +47,15 @@ def test_boxes_follow_a_shift():
     assert keep.tolist() == [True, True, False]
 
 
+@pytest.mark.quick
+def test_a_box_without_an_area_has_no_inside():
+    flow = torch.tensor([10.0, -5.0]).view(2, 1, 1).expand(2, *SIZE)
+    boxes = torch.tensor([[20.0, 30.0, 20.0, 30.0], [0, 0, 0, 0], [300, 300, 300, 300], [20, 30, 20, 60]])
+    warped, keep = warp_boxes(boxes, flow, clip=False)
+    assert warped.tolist() == (boxes - torch.tensor([10.0, -5.0, 10.0, -5.0])).tolist()
+    assert not keep.any()
+
+
 def mask_bounds(box: Tensor, source: tuple[Tensor, Tensor]) -> Tensor | None:
     """Return the bounds of all output pixels that show the inside of a box, from edge to edge, or None."""
     x, y = source

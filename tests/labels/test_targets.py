@@ -243,6 +243,9 @@ def test_all_rows_of_dropped_boxes_are_removed():
         "tracks": [[1, 2], [3], [4, 5, 6]],
     }
     of_image = {"image_id": torch.tensor([7, 7, 7]), "orig_size": (3, 36, 64), "camera_matrix": torch.eye(3)}
+    # Of the whole image by the names that MMDetection and Ultralytics give.
+    of_image |= dict.fromkeys(("ori_shape", "pad_shape", "resized_shape", "canvas_size", "resolution"), (36, 64, 3))
+    of_image |= {"scale_factor": [1.0, 1.0, 1.0], "ratio_pad": ((1.0, 1.0), (0.0, 0.0), (0.0, 0.0))}
     other = {"semantic": tv.Mask(torch.zeros(SIZE)), "image": tv.Image(torch.rand(3, *SIZE)), "ids": torch.arange(4)}
     warped = warp_labels(sample | rows | of_image | other, SHIFT)
     for key, value in (rows | {key: sample[key] for key in ("boxes", "labels", "masks")}).items():

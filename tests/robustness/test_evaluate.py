@@ -13,7 +13,7 @@ from torchrefract.effects.base import Effect
 from torchrefract.fields import fog_volume
 from torchrefract.robustness import Level, Quantity, Robustness, evaluate
 from torchrefract.robustness.report import format_tolerated
-from torchrefract.robustness.scores import as_labels, classification_score, detection_score
+from torchrefract.robustness.scores import as_labels, classification_score, detection_score, segmentation_score
 
 VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
 RANGES = {1: (500.0, 1000.0), 2: (200.0, 500.0), 3: (60.0, 200.0), 4: (40.0, 60.0), 5: (20.0, 40.0)}
@@ -183,6 +183,23 @@ def test_labels_and_clean_predictions_move_along_the_flow():
         result = evaluate(predict, samples, {"lens": {3: lens}}, detection_score, **options)
         assert [row.score.value for row in result.rows()] == [1]
         assert result.worst_case[Level("lens", 3)].tolist() == [1]  # of three lenses, each with its flow
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64])
+def test_pixels_that_show_nothing_of_the_clean_image_are_not_scored(dtype):
+    def predict(images: Tensor) -> Tensor:
+        """Take all for class 1, of three."""
+        return torch.tensor([0.0, 1, 0]).view(1, 3, 1, 1).expand(len(images), 3, *images.shape[2:])
+
+    lens = LensDistortion(k1_range=(-0.3, -0.3), frame="pad")
+    image = torch.ones(3, 60, 90)
+    assert 0.01 < (lens.degrade(image).image == 0).float().mean() < 0.5
+    for target in (tv_tensors.Mask(torch.ones(60, 90, dtype=dtype)), None):
+        samples = [("a.png", image, target)]
+        result = evaluate(predict, samples, {"lens": {3: lens}}, segmentation_score, as_target=as_labels)
+        assert [row.score.value for row in result.rows()] == [1]
+        assert result.set_scores[Level("lens", 3)] == {"mIoU": 1}
 
 
 @pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test counts fields

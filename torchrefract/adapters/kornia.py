@@ -27,7 +27,8 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     Boxes become the smallest boxes around their warped outlines, and a box that leaves the frame becomes zeros, as by
     kornia's `filter_boxes_by_area`, since a batch cannot drop one. Keypoints without a position in the degraded image
     become (-1, -1). Class labels stay. `params` replay a draw; it has no inverse, and its matrix is the identity.
-    Labels come in one call with their image, whose depth may decide its flow.
+    Labels come in one call with their image, whose depth may decide its flow. In a `VideoSequential` with
+    `same_on_frame`, the frames of a clip have one draw, at one time.
 
     Args:
         effect: the effect; its own `p` decides which samples it degrades.
@@ -44,7 +45,8 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draw the seed and the keys of the samples, which determine the parameters of the effect."""
         keys = torch.zeros(batch_shape[0], dtype=torch.int64) if self.same_on_batch else torch.arange(batch_shape[0])
-        return {"seed": torch.as_tensor(random.call_seed()), "keys": keys}
+        # A `VideoSequential` repeats each parameter along its first dimension, once for each frame.
+        return {"seed": torch.as_tensor(random.call_seed()).reshape(1), "keys": keys}
 
     def compute_transformation(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any]) -> Tensor:
         """Return identities, (B, 3, 3): no matrix describes an effect."""
@@ -54,7 +56,7 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
         """Degrade images, (B, C, H, W)."""
-        degraded = self.effect.degrade(input, seed=params["seed"], keys=params["keys"])
+        degraded = self.effect.degrade(input, seed=params["seed"].reshape(-1)[:1], keys=params["keys"])
         self._drawn = params["seed"], degraded.flow
         return degraded.image
 

@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
@@ -51,7 +52,7 @@ from torchrefract.data.label_files import (
     read_labels,
 )
 from torchrefract.data.pairs.configuration import claim
-from torchrefract.data.pairs.files import FORMATS, encode_maps
+from torchrefract.data.pairs.files import FORMATS, count_out_of_range, encode_maps
 from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.workers import map_in_processes
@@ -88,6 +89,7 @@ class _Result(NamedTuple):
     annotations: list[Annotation] | None = None  # for a COCO JSON
     error: str = ""
     is_lost: bool = False  # the file vanished
+    is_beyond: bool = False  # a flow exceeds the range of a PNG
 
 
 class Degrader(NamedTuple):
@@ -130,9 +132,9 @@ class Degrader(NamedTuple):
                 result = result._replace(annotations=content)
             else:
                 _write(self.out / "labels" / PurePosixPath(task.name).with_suffix(task.labels.path.suffix), content)
-        self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
+        is_beyond = self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
         media.write_picture(degraded.image[0], path, source=file)
-        return result
+        return result._replace(is_beyond=is_beyond)
 
     def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()
@@ -171,6 +173,8 @@ class Degrader(NamedTuple):
         return labels.move(degraded.flow[0] if has_flow else None, (height, width))
 
     def _video(self, task: _Task, file: Path, path: Path) -> _Result:
+        beyond = list[bool]()
+
         def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
             effect = params = None
             for t, frame in enumerate(frames):
@@ -180,10 +184,11 @@ class Degrader(NamedTuple):
                         effect = self._effect(frame)
                         params = effect.sample(frame, seed=self.seed, keys=[key_of(task.name)])
                     degraded = effect.apply(frame, params, frame=t, depth=self._depth(task.name, frame, t))
-                self._write_maps(degraded, PurePosixPath(task.name, f"{t:06d}"))
+                beyond.append(self._write_maps(degraded, PurePosixPath(task.name, f"{t:06d}")))
                 yield pixels_of(degraded.image[0])
 
-        return _Result(task.file, task.name, num_frames=media.convert_video(file, path, change=change))
+        num_frames = media.convert_video(file, path, change=change)
+        return _Result(task.file, task.name, num_frames=num_frames, is_beyond=any(beyond))
 
     def _effect(self, image: Tensor) -> Effect:
         return _make_effect(self.scene, image.shape[3] if self.has_width else None)
@@ -192,9 +197,14 @@ class Degrader(NamedTuple):
         height, width = image.shape[2:]
         return self.depth and self.depth.read(name, frame, frame_size=(height, width), size=None)[None]
 
-    def _write_maps(self, degraded: Degraded, stem: PurePosixPath) -> None:
-        for suffix, data in encode_maps(maps_of(degraded, None), self.maps).items() if self.maps else ():
+    def _write_maps(self, degraded: Degraded, stem: PurePosixPath) -> bool:
+        """Write the maps of a frame, if asked for; return True if a flow exceeds the range of a PNG."""
+        if self.maps is None:
+            return False
+        maps = maps_of(degraded, None)
+        for suffix, data in encode_maps(maps, self.maps).items():
             _write(self.out / "maps" / f"{stem}.{suffix}", data)
+        return self.maps == "png" and bool(count_out_of_range(maps))
 
 
 @lru_cache(maxsize=16)
@@ -273,7 +283,7 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
             if not _is_complete(task, job, stored)
             or (isinstance(labels, CocoLabels) and task.labels and task.name not in finished)
         ]
-        _warn([task.file for task in missing], tasks, labels)
+        _warn([task.file for task in missing], tasks, labels, has_camera=cfg.scene.get("camera") is not None)
         _degrade_missing(missing, job, workers=min(workers, len(missing)), names=names)
         if isinstance(labels, CocoLabels):
             moved = dict(_read_journal(out))
@@ -289,10 +299,11 @@ def _is_complete(task: _Task, job: Degrader, stored: Mapping[str, int] | None) -
 
 def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, names: dict[str, Path]) -> None:
     start, num_frames, num_dropped = time.perf_counter(), 0, 0
-    failed = list[_Result]()
+    failed, beyond = list[_Result](), list[str]()
     results = map_in_processes(job, missing, workers=workers, preload=__name__) if missing else ()
     for result in progress(results, "degrading", count=len(missing)):
         num_frames, num_dropped = num_frames + result.num_frames, num_dropped + result.num_dropped
+        beyond += [result.name] if result.is_beyond else []
         if result.error:
             failed.append(result)
             print(f"skipped: {result.error}", file=sys.stderr)
@@ -307,6 +318,11 @@ def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, n
     dropped = f"; {num_dropped} labels left the frame" if any(task.labels for task in missing) else ""
     print(f"{job.out}: {num_degraded} degraded, {num_existing} already existed, {len(failed)} skipped{dropped}")
     print(f"{num_frames} frames, {rate:.3g} frames a second")
+    if beyond:
+        print_warning(
+            f"the flows of {first_names(sorted(beyond))} exceed 512 px, the range of a PNG, where they are clipped and "
+            "marked as not valid; maps=npz or safetensors holds them"
+        )
     check_none_lost([result.error for result in failed if result.is_lost], name="source")
 
 
@@ -356,7 +372,7 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
     return {
         "source": str(root.resolve()),
         "scene": scene,
-        "files": file_digests(scene.values()),  # as that of a camera
+        "files": file_digests(pytree.tree_leaves(scene)),  # as that of a camera
         "width": "of each file" if job.has_width else None,
         "seed": job.seed,
         "drives": job.shots and hashlib.sha256(repr(sorted(job.shots.items())).encode()).hexdigest(),
@@ -367,12 +383,13 @@ def _settings(cfg: DictConfig, root: Path, job: Degrader, labels: _Labels | None
     }
 
 
-def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None) -> None:
+def _warn(missing: Sequence[Path], tasks: Sequence[_Task], labels: _Labels | None, *, has_camera: bool) -> None:
     if missing and is_remote(missing[0]):  # the header of each file would cost a request for all of it
         missing = missing[:: len(missing) // _SAMPLES or 1]
     messages = media.describe_losses(missing, upright=True)
-    if labels:
+    if labels or has_camera:
         messages.append(media.describe_turned(missing, upright=True))
+    if labels:
         without = [t.name for t in tasks if not t.labels and (media.is_video(t.file) or isinstance(labels, CocoLabels))]
         messages.append(f"labels do not list {len(without)} of the files: {first_names(without)}" if without else "")
     for message in filter(None, messages):

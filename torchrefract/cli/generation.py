@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch.utils import _pytree as pytree
 
 from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
 from torchrefract._validation import (
@@ -35,6 +36,7 @@ from torchrefract.cli.options import (
     check_seed,
     depth_folder,
     disk_errors,
+    file_digests,
     make_effect,
     naming,
     place_scene,
@@ -126,7 +128,12 @@ def generate(cfg: DictConfig) -> None:
             about = {"license": options.license, "made_with": _VERSIONS}
             suffix, num_pairs = shard_suffix(*options.shard), options.num_pairs
             previous = claim(
-                out, options.settings, count=num_pairs, about=about, earlier={"device": "cpu"}, suffix=suffix
+                out,
+                options.settings,
+                count=num_pairs,
+                about=about,
+                earlier={"device": "cpu"},
+                suffix=suffix,
             )
             options.write_list()
         if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
@@ -218,7 +225,8 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
     reader = SourceReader(sources.root, plain["size"], depth, camera)
     generator = PairGenerator(effect, scene["name"], reader, cfg.seed, plain["maps"], plain["device"])
-    settings = {"scene": scene, **plain, "frames": sources.num_frames, "sources": sources.digest()}
+    files = file_digests(pytree.tree_leaves(scene))  # as that of a camera
+    settings = {"scene": scene, "files": files, **plain, "frames": sources.num_frames, "sources": sources.digest()}
     return Options(
         generator, sources, write_list, settings, num_pairs, str(cfg.license), shard, workers, engine, verify, set()
     )

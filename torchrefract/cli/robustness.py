@@ -277,8 +277,7 @@ def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     content: Any = [] if labels is None else labels.move(None, size).content  # raises for labels of another size
     if isinstance(labels, MaskFile):
         with Image.open(io.BytesIO(content)) as picture:
-            pixels = np.array(picture)
-            return tv_tensors.Mask(pixels.astype(np.int32) if pixels.dtype == np.uint16 else pixels)
+            return tv_tensors.Mask(np.array(picture).astype(np.int32))
     if isinstance(labels, YoloFile):
         boxes, classes = boxes_of_yolo(content, labels, size)
     else:

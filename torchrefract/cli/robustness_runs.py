@@ -26,7 +26,7 @@ from torchrefract.robustness.predictors import import_function
 from torchrefract.robustness.quantities import QUANTITIES
 
 SCORES = "scores.jsonl"  # one line of settings, then one for each picture
-FORMAT = 2  # of these lines; 1 had no summaries of predictions
+FORMAT = 3  # of these lines; 1 had no summaries of predictions, 2 scored pixels that show nothing
 _VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 # Settings that a base shares, besides its data, scenes and severities.
 _SHARED = ("labels", "score", "depth_scale", "seed", "camera", "horizon", "effects", "format")

@@ -117,14 +117,16 @@ def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tens
     return to_float(torch.from_numpy(_decode(path, data, upright=upright))).permute(2, 0, 1)
 
 
-def upright_exif(header: ImageHeader) -> bytes:
-    """Return the EXIF data of a header with orientation 1, for pixels that are turned upright."""
+def exif_of_result(header: ImageHeader, *, upright: bool) -> bytes:
+    """Return the EXIF data of a header for other pixels: without its thumbnail, and if `upright` with orientation 1."""
     data = bytearray(header.exif)
     order = "little" if data.startswith(b"II") else "big"
     start = int.from_bytes(data[4:8], order) + 2
-    for entry in range(start, start + 12 * int.from_bytes(data[start - 2 : start], order), 12):
-        if int.from_bytes(data[entry : entry + 2], order) == _ORIENTATION:
+    end = start + 12 * int.from_bytes(data[start - 2 : start], order)
+    for entry in range(start, end, 12):
+        if upright and int.from_bytes(data[entry : entry + 2], order) == _ORIENTATION:
             data[entry + 8 : entry + 10] = (1).to_bytes(2, order)
+    data[end : end + 4] = bytes(len(data[end : end + 4]))  # the offset of the directory of the thumbnail
     return bytes(data)
 
 

@@ -19,11 +19,11 @@ from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
+    exif_of_result,
     files_in,
     image_header,
     image_size,
     pixels_of,
-    upright_exif,
     warn_of_unread,
 )
 from torchrefract.data.video import (
@@ -153,7 +153,7 @@ def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
     if not turned:
         return ""
     use = (
-        "They are read as displayed, and so labels must be of the displayed pictures"
+        "They are read as displayed, and so labels and a camera must be of the displayed pictures"
         if upright
         else "Their pixels are used as stored, since a camera's geometry holds in that frame"
     )
@@ -166,12 +166,12 @@ def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
 def write_picture(image: Tensor, path: Path, *, source: Path, upright: bool = True) -> None:
     """Write an image (3, H, W) in [0, 1], made from the picture `source`, in the format of the suffix.
 
-    EXIF data and a color profile of `source` are kept, and 16 bits in PNG. Image and orientation are those of
-    `read_image(source, upright=upright)`. Raises UsageError if the format cannot hold the picture.
+    EXIF data, but for a thumbnail, and a color profile of `source` are kept, and 16 bits in PNG. Image and orientation
+    are those of `read_image(source, upright=upright)`. Raises UsageError if the format cannot hold the picture.
     """
     header, suffix = image_header(source), path.suffix.lower()
     pixels = pixels_of(image, bits=header.bits if suffix == ".png" else 8)[..., ::-1]
-    data = {cv2.IMAGE_METADATA_EXIF: upright_exif(header) if upright else header.exif}
+    data = {cv2.IMAGE_METADATA_EXIF: exif_of_result(header, upright=upright)}
     if header.profile[16:20] == b"RGB ":  # profiles of gray or CMYK do not hold for RGB
         data[cv2.IMAGE_METADATA_ICCP] = header.profile
     kept = {kind: np.frombuffer(value, np.uint8) for kind, value in data.items() if value and suffix in _TAGGED}

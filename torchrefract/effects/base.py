@@ -100,7 +100,8 @@ class Effect(nn.Module, ABC):
                 vehicles among the boxes.
 
         Returns:
-            What was passed, in the same nesting, with the degraded image and the moved labels.
+            What was passed, in the same nesting, with the degraded image and the moved labels. A mask is 0 where the
+            degraded image shows nothing of the clean one; `degrade` and `warp_labels` with `mask_fill` give another id.
         """
         if target:
             result, degraded = self._degrade_like(image, target)

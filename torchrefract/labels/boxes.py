@@ -170,7 +170,8 @@ def _in_quadrilateral(points: Tensor, corners: Tensor) -> Tensor:
     low, high = sides[0].minimum(sides[1]), sides[0].maximum(sides[1])
     for side in sides[2:]:
         low, high = low.minimum(side), high.maximum(side)
-    return (low >= 0) | (high <= 0)
+    # All sides are 0 at the points of a quadrilateral without an area, and of the line that continues it.
+    return ((low >= 0) & (high > 0)) | ((high <= 0) & (low < 0))
 
 
 def _bounds(points: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:

@@ -31,6 +31,7 @@ _SAMPLES_PER_EDGE = 64
 _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible", "keypoint_visibility")
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
+_OF_IMAGE += ("_shape", "canvas", "resolution", "scale_factor", "ratio_pad")
 
 
 class _Options(NamedTuple):
@@ -117,9 +118,10 @@ def warp_labels(
     return _warp_target(target, flow, _Options(*limits, soft_masks, mask_fill, padding, interpolation))
 
 
-def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default") -> Any:
+def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default", *, mask_fill: float = 0) -> Any:
     """Warp labels like `warp_labels`, but return samples whose flow is zero unchanged: neither clipped nor dropped."""
-    return _warp_target(target, flow, _Options(keep_unmoved=True, labels_getter=check_labels_getter(labels_getter)))
+    options = _Options(keep_unmoved=True, labels_getter=check_labels_getter(labels_getter), mask_fill=mask_fill)
+    return _warp_target(target, flow, options)
 
 
 def check_labels_getter(labels_getter: Any) -> Any:

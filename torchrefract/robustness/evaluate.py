@@ -15,12 +15,13 @@ from torchrefract import random
 from torchrefract._tensor import sharing_results
 from torchrefract._validation import check_count, check_number, warn
 from torchrefract.effects.base import Effect
-from torchrefract.labels.targets import warp_moved_labels
-from torchrefract.robustness.set_scores import Summary, set_scores, summarize
+from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels
+from torchrefract.robustness.set_scores import IGNORED_CLASS, Summary, set_scores, summarize
 from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerated_value
 from torchrefract.types import Degraded
 
 _MAX_FAILED, _MIN_COUNT = 0.1, 10  # share of the images whose prediction may raise, and from how many on it counts
+_CLASS_TYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)  # of masks that can hold `IGNORED_CLASS`
 
 
 class Quantity(NamedTuple):
@@ -208,7 +209,8 @@ def evaluate(
 
     Args:
         predict: from images (B, 3, H, W), float in [0, 1], to a sequence of B predictions; B is 1 for clean images.
-        samples: name, image (3, H, W) and target of each image. Labels of the target move along the flow.
+        samples: name, image (3, H, W) and target of each image. Labels of the target move along the flow. A
+            target that is a `Mask` of integers gets 255 where the degraded image shows nothing of the clean one.
         scenes: by name, and in each the effects by severity; or a function that returns them for a width in px.
         score: from a prediction and a target to a number in [0, 1], higher is better; see `robustness.scores`.
         as_target: makes a target of the prediction for the clean image and its (height, width), for targets that are
@@ -284,13 +286,13 @@ def evaluate(
     return _collect(scored, quantities, failures)
 
 
-def move_target(target: Any, degraded: Degraded, effect: Effect) -> Any:
+def move_target(target: Any, degraded: Degraded, effect: Effect, *, mask_fill: int = 0) -> Any:
     """Return the labels of a degraded image, or of a batch, moved along its flow on their device; None stays None."""
     if target is None or not degraded.has("flow"):
         return target
     flow = degraded.flow.detach()
     device = next((leaf.device for leaf in pytree.tree_leaves(target) if isinstance(leaf, Tensor)), flow.device)
-    return warp_moved_labels(target, flow.to(device), effect.labels_getter)
+    return warp_moved_labels(target, flow.to(device), effect.labels_getter, mask_fill=mask_fill)
 
 
 def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
@@ -337,11 +339,14 @@ def _degraded(
     image: Tensor, target: Any, scenes: Scenes, seeds: Iterable[int], options: dict[str, Any]
 ) -> Generator[_Picture, None, None]:
     """Yield an image at each level of each scene, once for each seed."""
+    # No label is true where the degraded image shows nothing of the clean one.
+    mask_fill = IGNORED_CLASS if is_tv_tensor(target, "Mask") and target.dtype in _CLASS_TYPES else 0
     for (scene, effects), seed in itertools.product(scenes.items(), seeds):
         with sharing_results():  # the severities of a scene have the same random fields
             for severity, effect in effects.items():
                 degraded = effect.degrade(image, seed=seed, **options)
-                yield _Picture(Level(scene, severity), degraded, move_target(target, degraded, effect))
+                moved = move_target(target, degraded, effect, mask_fill=mask_fill)
+                yield _Picture(Level(scene, severity), degraded, moved)
 
 
 def _predict(predict: Callable[[Tensor], Any], images: Sequence[Tensor]) -> Any:

@@ -13,6 +13,8 @@ from torchrefract._validation import warn
 
 Summary = tuple[str, Any]
 
+IGNORED_CLASS = 255  # of pixels of a target that no score counts
+
 
 def summarize(prediction: Any, target: Any) -> Summary | None:
     """Return what the score of all images needs of one image, as values that JSON holds.
@@ -67,7 +69,7 @@ def class_areas(prediction: Tensor, target: Tensor) -> dict[int, tuple[int, int]
     classes = prediction.detach().cpu()
     classes = classes.argmax(dim=0) if classes.ndim == 3 else classes
     expected = torch.as_tensor(target).cpu().as_subclass(Tensor).reshape(classes.shape)
-    counts = (expected >= 0) & (expected != 255)
+    counts = (expected >= 0) & (expected != IGNORED_CLASS)
     classes, expected = classes[counts], expected[counts]
     areas = {}
     for name in torch.cat([classes, expected]).unique().tolist():

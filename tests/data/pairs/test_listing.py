@@ -114,6 +114,21 @@ def test_a_list_of_many_frames_takes_little_memory_and_keeps_any_name(tmp_path):
     assert next(iter(sources.frames())) == frames[0]._replace(bytes=7)
 
 
+def test_names_that_are_no_unicode_are_escaped_in_the_table_and_the_card(call, words, frames, tmp_path, rows):
+    shutil.copytree(frames, tmp_path / "frames")
+    first = sorted((tmp_path / "frames" / "drive1").iterdir())[0]
+    shutil.copy(first, first.with_name("\udcff.png"))
+    first.with_name("\udcfe.png").write_bytes(first.read_bytes()[:100])
+    outcome = call("generate", *words("out", source="frames"))
+    assert outcome.code == 0, outcome.err
+    assert "unreadable, tried again by the same command: drive1/\\udcfe.png is truncated" in outcome.out
+    assert "such as: drive1/\\udcfe.png is truncated" in (tmp_path / "out" / "README.md").read_text()
+    table = pq.read_table(tmp_path / "out" / "pairs.parquet")
+    names = [row["source"] for row in rows(tmp_path / "out") if not row["skipped"]]
+    assert table["source"].to_pylist() == [name.replace("\udcff", "\\udcff") for name in names]
+    assert "drive1/\udcff.png" in names
+
+
 def test_the_main_process_of_a_run_with_workers_makes_no_pair(call, words, monkeypatch):
     """Compiled effects would add half to its memory."""
 

@@ -66,7 +66,7 @@ def summarize(rows: Iterable[PairRow], *, settings: Mapping[str, Any]) -> Summar
     sources, skipped, files, num_bytes = set[tuple[str, int | None]](), [], (), 0
     for row in rows:
         if row.skipped:
-            skipped.append(row.skipped)
+            skipped.append(_as_unicode(row.skipped))
             continue
         table.add(row)
         split = row.split or "neither"
@@ -217,9 +217,9 @@ class PairTable:
             "name": row.name,
             "key": row.key,
             "seed": row.seed,
-            "source": row.source,
+            "source": _as_unicode(row.source),
             "frame": row.frame,
-            "drive": row.drive,
+            "drive": _as_unicode(row.drive),
             "split": row.split,
             "scene": row.scene,
             "severity": self._severity,
@@ -236,6 +236,11 @@ class PairTable:
             prefix = name if seen[name] == 1 else f"{name}{seen[name]}"
             values |= {f"{prefix}.{key}": _number(value) for key, value in effect.items() if key != "effect"}
         return values
+
+
+def _as_unicode(text: str) -> str:
+    """Escape the bytes of names of files that are no Unicode, which neither Parquet nor a terminal takes."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _number(value: Any) -> Any:

@@ -64,7 +64,7 @@ class Crop(NamedTuple):
 
     def of(self, image: Tensor, frame_width: int) -> Tensor:
         """Return this part of a frame (C, H, W) in any resolution, around its middle as `Camera.resized` has it."""
-        height, width = self.size(*image.shape[1:], frame_width)
+        height, width = self.size(image.shape[1], image.shape[2], frame_width)
         top, left = (image.shape[1] - height) // 2, (image.shape[2] - width) // 2
         return image[:, top : top + height, left : left + width]
 

@@ -128,12 +128,7 @@ def generate(cfg: DictConfig) -> None:
             about = {"license": options.license, "made_with": _VERSIONS}
             suffix, num_pairs = shard_suffix(*options.shard), options.num_pairs
             previous = claim(
-                out,
-                options.settings,
-                count=num_pairs,
-                about=about,
-                earlier={"device": "cpu"},
-                suffix=suffix,
+                out, options.settings, count=num_pairs, about=about, earlier={"device": "cpu"}, suffix=suffix
             )
             options.write_list()
         if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:

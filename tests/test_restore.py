@@ -296,6 +296,10 @@ def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
         (("tile=0",), "tile must be at least 1, got 0"),
         (("tile=half",), "tile must be (height, width), got 'half'"),
         (("size=64",), "size must be (height, width), got 64"),
+        (
+            ("size=[32,64]", "tile=32"),
+            "size must be null beside tile, which has the resolution of the frame, got [32, 64]",
+        ),
         (("batch=0",), "batch must be at least 1, got 0"),
         (("interpolation=cubic",), "interpolation must be one of nearest, bilinear, bicubic"),
         (("side_by_side=2",), "side_by_side must be True or False, got 2"),

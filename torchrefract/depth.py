@@ -105,7 +105,8 @@ class TransformersDepth:
             if width <= self.max_spread
             else RoadSpreadError(
                 f"depth must agree with a flat road up to a spread of {self.max_spread:g}, got {width:.2g}: describe "
-                'your camera by road=GroundPlaneDepth(...), or pass scale="model" to take the meters of the model'
+                'your camera by road=GroundPlaneDepth(...), or take the meters of the model by scale="model", in a '
+                "command by scale_by=model"
             )
             for (row, factor, width), sky in zip(rows, is_sky, strict=True)
         ]

@@ -64,11 +64,11 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
+    check_resumed,
     check_run_folder,
     how_to_continue,
     load_model,
     load_weights,
-    num_epochs_done,
     read_checkpoint,
 )
 from torchrefract.restoration.export import FORMATS, export_model
@@ -88,7 +88,7 @@ def train(cfg: DictConfig) -> None:
     data, model, trainer, checkpoint = _make_parts(cfg)
     if checkpoint is None:
         check_run_folder(as_path(cfg.run_dir))
-    num_epochs = num_epochs_done(checkpoint, config=cfg.model, path=cfg.ckpt_path) if checkpoint else 0
+    num_epochs = check_resumed(checkpoint, config=cfg.model, path=cfg.ckpt_path) if checkpoint else 0
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
@@ -345,16 +345,16 @@ def _make_job(cfg: DictConfig, source: Path, out: Path) -> _Job:
         tile = None if sides is None else check_size("tile", sides)
     if tile is not None and loaded.task == Undistort.name:
         raise UsageError(f"tile must be null for {loaded.task}, whose model needs the complete frame, got {cfg.tile}")
+    if tile is not None and cfg.size is not None:
+        raise UsageError(f"size must be null beside tile, which has the resolution of the frame, got {cfg.size}")
     if cfg.pool not in (None, "auto", "lens") or (cfg.pool == "lens" and loaded.task != Undistort.name):
         raise UsageError(
             f"pool must be auto, null, or lens for the task {Undistort.name}, got {cfg.pool} for {loaded.task}"
         )
     with naming("interpolation"):
-        options = {"tile": tile, "interpolation": cfg.interpolation, "batch": batch}
-        restorer = Restorer(loaded.model.to(device), size=size, **options)
+        restorer = Restorer(loaded.model.to(device), size=size, tile=tile, interpolation=cfg.interpolation, batch=batch)
     # Other networks of this task find warps that change from frame to frame, too.
-    finds_lenses = any(isinstance(part, LensEncoder) for part in loaded.model.modules())
-    pools_videos = cfg.pool == "auto" and finds_lenses
+    pools_videos = cfg.pool == "auto" and any(isinstance(part, LensEncoder) for part in loaded.model.modules())
     return _Job(restorer, restorer.restore, pools_videos, source, out, batch, side_by_side, deviation, device)
 
 

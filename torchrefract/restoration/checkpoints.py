@@ -128,8 +128,8 @@ def check_run_folder(run: Path) -> None:
         )
 
 
-def num_epochs_done(checkpoint: Mapping[str, Any], *, config: Mapping[str, Any], path: str) -> int:
-    """Return the number of complete epochs of a training checkpoint.
+def check_resumed(checkpoint: Mapping[str, Any], *, config: Mapping[str, Any], path: str) -> int:
+    """Check that a training can resume a checkpoint, and return the number of its complete epochs.
 
     Args:
         checkpoint: of `read_checkpoint`.

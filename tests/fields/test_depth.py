@@ -231,7 +231,10 @@ def test_check_depth_accepts_road_scenes_and_rejects_converted_ones(size):
     check_depth(depth)
     check_depth(depth.clamp(max=80.0))
     for sample in depth.split(1):
-        assert "not disparity or inverse depth" in error_of(360.5 / sample)
+        disparity = 360.5 / sample
+        assert "not disparity or inverse depth" in error_of(disparity)
+        # Files of depth have 0 where it is not known, which is then infinite.
+        assert "not disparity or inverse depth" in error_of(torch.where(disparity == 0, math.inf, disparity))
         assert "not normalized" in error_of(sample.amin() / sample)
         farthest = sample[sample.isfinite()].amax()
         assert "not normalized" in error_of((sample / farthest).clamp(max=1.0))
@@ -269,6 +272,8 @@ def test_check_depth_accepts_real_roads_and_rejects_converted_ones(shared_data):
         check_depth(depth.nan_to_num(posinf=0.0))  # as where 0 is no measurement
         assert "not disparity or inverse depth" in error_of(360.5 / depth)
         assert "not disparity or inverse depth" in error_of(1000 / depth)
+        if not depth.isfinite().all():
+            assert "not disparity or inverse depth" in error_of(torch.where(depth.isinf(), math.inf, 1000 / depth))
 
 
 def test_check_depth_accepts_unusual_depths_in_meters():

@@ -269,9 +269,9 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
     Each sample or clip is judged alone. Invalid are negative values and NaN; maps that look normalized (all finite
     values lie in [0, 1] and differ); whole numbers with a median above 1000, as of millimeters, and any numbers with
     such a median in the lower half; maps of which more than half is 0, as of lidar, whose zeros are holes; and maps
-    that look like disparity or inverse depth: no value is inf, a tenth of the upper half is at most 2 % of the largest
-    value, and the median of the lowest quarter is at least 20 % of it. Frames of a few pixels are tested for the first
-    two alone.
+    that look like disparity or inverse depth: a tenth of the upper half is inf or at most 2 % of the largest value, the
+    median of the lowest quarter is at least 20 % of it and, with inf as readers of files give for 0, more than twice
+    that of the upper half. Frames of a few pixels are tested for the first two alone.
 
     Args:
         depth: (B, 1, H, W) or (B, T, 1, H, W), m, inf for the sky.
@@ -373,12 +373,16 @@ def _ends_in_unit_range(values: Tensor) -> tuple[float, float] | None:
 
 
 def _check_not_inverse(name: str, values: Tensor) -> None:
+    is_far = values.isinf()
+    values = torch.where(is_far, 0.0, values)
     top, bottom = values[:, : values.shape[1] // 2], values[:, -max(1, values.shape[1] // 4) :]
     largest = values.amax().item()
-    if top.numel() < _MIN_UPPER_HALF or largest == math.inf:
+    if top.numel() < _MIN_UPPER_HALF:
         return
     share, median = (top <= 0.02 * largest).double().mean().item(), bottom.median().item()
-    if share >= 0.1 and 0 < 0.2 * largest <= median:
+    known = top[top > 0]
+    falls = not is_far.any() or (known.numel() > 0 and known.median().item() < 0.5 * median)
+    if share >= 0.1 and 0 < 0.2 * largest <= median and falls:
         raise ValueError(
             f"{name} must be in m, not disparity or inverse depth, where 0 is far (see depth_from_disparity and "
             f"depth_from_inverse), got {share:.0%} of the upper half near 0 over a median of {median:g} at the bottom"

@@ -380,8 +380,8 @@ def _check_not_inverse(name: str, values: Tensor) -> None:
     if top.numel() < _MIN_UPPER_HALF:
         return
     share, median = (top <= 0.02 * largest).double().mean().item(), bottom.median().item()
-    known = top[top > 0]
-    falls = not is_far.any() or (known.numel() > 0 and known.median().item() < 0.5 * median)
+    positive = top[top > 0]
+    falls = not is_far.any() or (positive.numel() > 0 and positive.median().item() < 0.5 * median)
     if share >= 0.1 and 0 < 0.2 * largest <= median and falls:
         raise ValueError(
             f"{name} must be in m, not disparity or inverse depth, where 0 is far (see depth_from_disparity and "

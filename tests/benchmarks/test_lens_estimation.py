@@ -89,6 +89,7 @@ def test_held_out_frames_leave_out_drives_whose_lens_shows(tmp_path, monkeypatch
     rows = lens_estimation.held_out(tmp_path, (144, 256), without=("bent_",))
     assert [row["frame"] for row in rows] == ["val/b_1.png"] * 4
     assert len({row["nothing"] for row in rows}) == 4  # lenses
+    assert rows[0]["lines"] < 0.5 * min(rows[0]["constant"], rows[0]["nothing"])
     lines, constant, nothing = (fmean(row[kind] for row in rows) for kind in ("lines", "constant", "nothing"))
     assert lines < 0.5 * min(constant, nothing)
     assert "4 lenses of 1 frames" in capsys.readouterr().out

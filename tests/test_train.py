@@ -243,11 +243,14 @@ def test_a_resumed_run_keeps_its_optimizer(call, trained, word, stored):
     assert not Path("run").exists()
 
 
-def test_a_resumed_run_warns_of_other_values(call, trained):
-    words = (f"ckpt_path={trained.folder / 'last.ckpt'}", "trainer.max_epochs=3", "data.val_count=2", "run_dir=run")
+@pytest.mark.parametrize("word", ["data.val_count=2", "data.batch_size=4"])
+def test_a_resumed_run_warns_of_other_values(call, trained, word):
+    words = (f"ckpt_path={trained.folder / 'last.ckpt'}", "trainer.max_epochs=3", word, "run_dir=run")
     outcome = call("train", *trained.words, *words)
     assert outcome.code == 0
-    assert outcome.err == "warning: the training continues with other values than before of data.val_count\n"
+    warning, *rest = outcome.err.splitlines()
+    assert warning == f"warning: the training continues with other values than before of {word.partition('=')[0]}"
+    assert not rest
 
 
 def test_a_new_training_does_not_replace_the_checkpoints_of_another_one(call, trained, tmp_path):

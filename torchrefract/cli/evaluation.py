@@ -85,12 +85,12 @@ def use_validation_config(
     return changed_values(cfg, checkpoint)
 
 
-def changed_values(cfg: DictConfig, checkpoint: dict[str, Any]) -> list[str]:
+def changed_values(cfg: DictConfig, checkpoint: dict[str, Any], *, ignored: Sequence[str] = _NOT_COMPARED) -> list[str]:
     """Return the names of the values of data and model that differ from those of a checkpoint's configuration."""
     stored = checkpoint.get("config")
     if not (isinstance(stored, dict) and all(isinstance(stored.get(part), dict) for part in ("data", "model"))):
         return []
-    before, after = map(_compared, (stored, cast(Any, OmegaConf.to_container(cfg))))
+    before, after = (_compared(config, ignored) for config in (stored, cast(Any, OmegaConf.to_container(cfg))))
     return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
 
 
@@ -127,8 +127,8 @@ def _is_allowed(value: Any) -> bool:
     return is_class or (isfunction(value) and value.__module__ in _MODULES and not value.__name__.startswith("_"))
 
 
-def _compared(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the values that change a score, by their names."""
+def _compared(config: dict[str, Any], ignored: Sequence[str]) -> dict[str, Any]:
+    """Return the values of data and model but for those of ignored names, and the limit of validations, by names."""
     parts = flatten({part: config[part] for part in ("data", "model")})
-    values = {name: value for name, value in parts if name.rpartition(".")[2] not in _NOT_COMPARED}
+    values = {name: value for name, value in parts if name.rpartition(".")[2] not in ignored}
     return values | {"trainer.limit_val_batches": (config.get("trainer") or {}).get("limit_val_batches")}

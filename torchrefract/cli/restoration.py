@@ -93,7 +93,7 @@ def train(cfg: DictConfig) -> None:
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
         raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
-    if checkpoint and (changed := changed_values(cfg, checkpoint)):
+    if checkpoint and (changed := changed_values(cfg, checkpoint, ignored=("workers", "pretrained"))):
         print_warning(f"the training continues with other values than before of {', '.join(changed)}")
     initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
     licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)

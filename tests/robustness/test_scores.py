@@ -98,3 +98,33 @@ def test_a_prediction_that_does_not_fit_its_labels_raises(valid, prediction, mes
     check_prediction(*valid)
     with pytest.raises(ValueError, match=message):
         check_prediction(prediction, valid[1])
+
+
+@pytest.mark.parametrize(
+    ("score", "prediction", "target"),
+    [
+        (segmentation_score, torch.rand(1, 4, 5), torch.zeros(4, 5).long()),
+        (segmentation_score, torch.ones(1, 4, 5).long(), torch.zeros(4, 5).long()),
+        (segmentation_score, torch.rand(4, 5), torch.zeros(4, 5).long()),
+        (classification_score, torch.rand(1), 0),
+    ],
+)
+def test_one_score_of_two_classes_raises_as_its_highest_class_never_changes(score, prediction, target):
+    message = r"scores of at least two classes, .*, got a tensor .*; one logit x is the scores -x and x"
+    for call in (score, check_prediction):
+        with pytest.raises(ValueError, match=message):
+            call(prediction, target)
+    with pytest.raises(ValueError, match=message):
+        as_labels(prediction, (4, 5))
+
+
+@pytest.mark.parametrize(
+    ("prediction", "message"),
+    [
+        (torch.rand(2, 2, 3), r"size of the image, \(4, 5\), got a tensor \(2, 2, 3\); resize the scores of classes"),
+        (BOXES | {"boxes": torch.tensor([[0.1, 0.2, 0.5, 0.9]] * 2), "scores": torch.ones(2)}, "boxes must be in px"),
+    ],
+)
+def test_predictions_in_other_units_than_the_px_of_the_image_are_no_labels(prediction, message):
+    with pytest.raises(ValueError, match=message):
+        as_labels(prediction, (4, 5))

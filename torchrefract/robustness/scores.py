@@ -40,12 +40,14 @@ def segmentation_score(prediction: Tensor, target: Tensor) -> float:
         prediction: (K, H, W), a score of each class at each pixel, or (H, W), integers.
         target: (H, W) or (1, H, W), integers.
     """
+    check_prediction(prediction)
     areas = class_areas(prediction, target).values()
     return sum(intersection / union for intersection, union in areas) / len(areas) if areas else 1.0
 
 
 def classification_score(prediction: Tensor, target: Tensor | int) -> float:
     """Return 1.0 if the class with the highest of the scores (K,) is the target, else 0.0."""
+    check_prediction(prediction)
     return float(prediction.detach().cpu().argmax().item() == int(target))
 
 
@@ -59,10 +61,17 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
     if isinstance(prediction, dict):
         keep = prediction["scores"] >= _CONFIDENT
         boxes = prediction["boxes"][keep].detach()
+        if len(boxes) and ((boxes >= 0) & (boxes <= 1)).all():
+            raise ValueError("boxes must be in px, got all in [0, 1]; multiply them by the size of the image")
         options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
         return {"boxes": tv_tensors.BoundingBoxes(boxes, **options), "labels": prediction["labels"][keep].detach()}
     if prediction.ndim == 1:
         return int(prediction.argmax())
+    if tuple(prediction.shape[-2:]) != size:
+        raise ValueError(
+            f"predictions must have the size of the image, {size}, got {_described(prediction)}; resize the scores of "
+            "classes to it"
+        )
     return tv_tensors.Mask((prediction.argmax(dim=0) if prediction.ndim == 3 else prediction).detach())
 
 
@@ -72,9 +81,11 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         parts = [prediction.get(name) for name in ("boxes", "labels", "scores")]
         shapes = [part.shape if isinstance(part, Tensor) else None for part in parts]
         is_valid = shapes[1] is not None and len(shapes[1]) == 1 and shapes == [(*shapes[1], 4), shapes[1], shapes[1]]
-        fits = isinstance(target, dict)
+        fits, has_classes = isinstance(target, dict), True
     else:
         is_valid = isinstance(prediction, Tensor) and prediction.ndim in (1, 2, 3)
+        # The highest of the scores of one class is always that class.
+        has_classes = is_valid and (len(prediction) > 1 if prediction.ndim != 2 else not prediction.is_floating_point())
         size = prediction.shape[-2:] if is_valid and prediction.ndim > 1 else ()
         fits = not isinstance(target, dict) and getattr(target, "shape", ())[-2:] == size
     if not is_valid:
@@ -86,6 +97,11 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         raise ValueError(
             "predictions must have the kind and the size of the labels: boxes for boxes, a class of each pixel for a "
             f"mask, got {_described(prediction)} for {_described(target)}"
+        )
+    if not has_classes:
+        raise ValueError(
+            "predictions must be scores of at least two classes, (K, H, W) or (K,), or classes (H, W), integers, got "
+            f"{_described(prediction)}; one logit x is the scores -x and x, one probability p is 1 - p and p"
         )
 
 

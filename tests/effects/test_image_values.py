@@ -96,6 +96,19 @@ def test_other_layouts_and_types_raise(image, error, message):
         UniformFog()(image)
 
 
+def test_labels_in_the_place_of_the_image_raise():
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra train")
+    mask = tv_tensors.Mask(torch.zeros(1, 48, 60, dtype=torch.uint8))
+    points = tv_tensors.KeyPoints(torch.rand(1, 3, 2), canvas_size=(48, 60))
+    for label in (mask, points):
+        with pytest.raises(
+            TypeError, match=rf"image must be an image, got {type(label).__name__} of torchvision; pass"
+        ):
+            UniformFog()(label, tv_tensors.Image(torch.rand(3, 48, 60)))
+        with pytest.raises(TypeError, match="image must be an image"):
+            UniformFog().degrade(label, seed=0)
+
+
 def test_a_picture_of_pillow_raises():
     picture = pytest.importorskip("PIL.Image", reason="pillow is in the extra train").new("RGB", (60, 48))
     for inputs in ((picture,), (picture, {}), ({"image": picture, "labels": torch.arange(2)},)):

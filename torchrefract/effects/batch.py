@@ -50,7 +50,7 @@ def check_image(image: Tensor) -> BatchShape:
 
     Raises:
         ValueError: another number of dimensions; no channel, no pixel or no frame.
-        TypeError: neither floating nor uint8; or `torch.jit.trace` runs.
+        TypeError: neither floating nor uint8; labels of torchvision; or `torch.jit.trace` runs.
     """
     if torch.jit.is_tracing():
         raise TypeError(
@@ -63,6 +63,11 @@ def check_image(image: Tensor) -> BatchShape:
             "v2.functional.to_image of torchvision, or place v2.ToImage() before the effect"
         )
     check_tensor("image", image)
+    if type(image) is not Tensor and any(is_tv_tensor(image, kind) for kind in ("Mask", "KeyPoints", "BoundingBoxes")):
+        raise TypeError(
+            f"image must be an image, got {type(image).__name__} of torchvision; pass labels after the image, as in "
+            "effect(image, mask)"
+        )
     if image.ndim not in (3, 4, 5) or 0 in image.shape[-3:]:
         raise ValueError(
             f"image must have shape (B, C, H, W), (C, H, W) or, for clips, (B, T, C, H, W), got {tuple(image.shape)}"

@@ -261,6 +261,31 @@ def test_all_rows_of_dropped_boxes_are_removed():
     assert warped["ids"] is other["ids"]
 
 
+def test_lists_with_a_dict_mask_or_tensor_for_each_box_lose_those_of_dropped_boxes():
+    sample, generated = detection(), generator()
+    points = [tv.KeyPoints(torch.rand(17, 2, generator=generated) * 20, canvas_size=SIZE) for _ in range(3)]
+    rows = {
+        "attributes": [{"occluded": 0, "parts": [1]}, {"occluded": 1}, {"occluded": 2}],
+        "tracks": (torch.tensor(5), torch.tensor(6), torch.tensor(7)),
+        "instances": [tv.Mask(mask) for mask in sample["masks"]],
+        "pose": [{"points": of, "visible": torch.ones(17)} for of in points],
+    }
+    others = {"cameras": [{"name": name} for name in "abc"], "pairs": [torch.arange(3), {"a": 1}, 7], "two": [{}, {}]}
+    warped = warp_labels(sample | rows | others, SHIFT)
+    assert warped["attributes"] == [{"occluded": 0, "parts": [1]}, {"occluded": 2}]
+    assert warped["tracks"] == (rows["tracks"][0], rows["tracks"][2])
+    assert all(map(torch.equal, warped["instances"], warped["masks"]))
+    for pose, expected in zip(warped["pose"], (points[0], points[2]), strict=True):
+        moved = warp_labels({"points": expected, "visible": torch.ones(17)}, SHIFT)
+        assert all(torch.equal(pose[name], moved[name]) for name in moved)
+    assert warped["cameras"] == others["cameras"]
+    assert warped["pairs"][0].tolist() == [0, 2]  # rows of a tensor, not entries of the list
+    assert (len(warped["pairs"]), len(warped["two"])) == (3, 2)
+    getter = warp_labels(sample | rows, SHIFT, labels_getter=lambda inputs: inputs["tracks"])
+    assert (len(getter["tracks"]), len(getter["attributes"]), len(getter["labels"])) == (2, 3, 3)
+    assert len(warp_labels(sample | rows, SHIFT, drop=False)["attributes"]) == 3
+
+
 def test_a_matrix_that_loses_rows_with_the_boxes_is_warned_of():
     sample = detection() | {"K": torch.eye(3)}
     with pytest.warns(UserWarning, match=r"target\['K'\] has as many rows as there are boxes and lost those"):

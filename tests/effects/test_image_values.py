@@ -62,6 +62,13 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
     assert len(calls) == 3
 
 
+def test_a_black_frame_does_not_stand_for_the_values_of_those_that_follow():
+    effect = UniformFog()
+    effect(torch.zeros(3, 20, 30))
+    with pytest.raises(ValueError, match=r"image must lie in \[0, 1\] if it is floating"):
+        effect(255 * photo(3, 20, 30))
+
+
 def test_a_clip_with_the_channels_before_the_frames_is_warned_of():
     with pytest.warns(
         UserWarning, match=r"taken for clips of 3 frames with 8 channels; use image\.movedim\(-4, -3\) if"

@@ -336,8 +336,7 @@ class Effect(nn.Module, ABC):
             return
         checked = _CHECKED_SHAPES.setdefault(self, set())
         kind = (image.shape, image.dtype)
-        if kind not in checked:
-            check_image_values(image)
+        if kind not in checked and not check_image_values(image):
             if len(checked) >= _MAX_CHECKED_SHAPES:
                 checked.clear()
             checked.add(kind)

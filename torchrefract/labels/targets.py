@@ -270,7 +270,9 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
         warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
-        warped = convert_boxes(warped + 0.5, "XYXY", boxes.format.name)
+        warped = _cast(convert_boxes(warped + 0.5, "XYXY", boxes.format.name), boxes.dtype)
+        size = warped[:, 2:] - warped[:, :2] if boxes.format.name == "XYXY" else warped[:, 2:]
+        keep = keep & (size > 0).all(dim=1)  # rounding can close a narrow box
     return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
 
 

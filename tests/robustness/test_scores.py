@@ -2,6 +2,8 @@ from typing import Any
 
 import pytest
 import torch
+from torchvision import tv_tensors
+from torchvision.transforms.v2.functional import convert_bounding_box_format
 
 from torchrefract.robustness.scores import (
     as_labels,
@@ -10,6 +12,7 @@ from torchrefract.robustness.scores import (
     detection_score,
     segmentation_score,
 )
+from torchrefract.robustness.set_scores import set_scores, summarize
 
 pytestmark = pytest.mark.quick
 
@@ -128,3 +131,16 @@ def test_one_score_of_two_classes_raises_as_its_highest_class_never_changes(scor
 def test_predictions_in_other_units_than_the_px_of_the_image_are_no_labels(prediction, message):
     with pytest.raises(ValueError, match=message):
         as_labels(prediction, (4, 5))
+
+
+@pytest.mark.parametrize("form", ["XYXY", "XYWH", "CXCYWH"])
+def test_boxes_of_torchvision_are_scored_by_their_format(form):
+    options: dict[str, Any] = {"format": "XYXY", "canvas_size": (40, 80)}
+    boxes = tv_tensors.BoundingBoxes(torch.tensor([[40.0, 20, 60, 30], [2, 4, 12, 24]]), **options)
+    converted = convert_bounding_box_format(boxes, new_format=form)
+    labels, scores = torch.tensor([1, 2]), torch.tensor([0.9, 0.8])
+    for predicted, expected in ((boxes.as_subclass(torch.Tensor), converted), (converted, boxes)):
+        prediction = {"boxes": predicted, "labels": labels, "scores": scores}
+        assert detection_score(prediction, {"boxes": expected, "labels": labels}) == 1
+        assert set_scores([summarize(prediction, {"boxes": expected, "labels": labels})])["mAP"] == pytest.approx(1)
+        assert torch.equal(as_labels(prediction, (40, 80))["boxes"], boxes)

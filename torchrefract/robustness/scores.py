@@ -7,7 +7,7 @@ from torch import Tensor
 from torchvision import tv_tensors
 from torchvision.ops import box_iou
 
-from torchrefract.robustness.set_scores import class_areas
+from torchrefract.robustness.set_scores import class_areas, corners_of
 
 _IOU = 0.5  # from which a box is found
 _CONFIDENT = 0.5  # score from which a detection counts as a label
@@ -20,10 +20,10 @@ def detection_score(prediction: dict[str, Tensor], target: dict[str, Any]) -> fl
 
     Args:
         prediction: `boxes` (n, 4), x1 y1 x2 y2 in px, `labels` (n,) and `scores` (n,), as of torchvision's detectors.
-        target: `boxes` (m, 4) and `labels` (m,).
+        target: `boxes` (m, 4) and `labels` (m,). Boxes of torchvision may have any format that is not rotated.
     """
-    boxes, labels, scores = (prediction[name].detach().cpu() for name in ("boxes", "labels", "scores"))
-    true_boxes = torch.as_tensor(target["boxes"]).cpu().as_subclass(Tensor).view(-1, 4)
+    labels, scores = (prediction[name].detach().cpu() for name in ("labels", "scores"))
+    boxes, true_boxes = corners_of(prediction["boxes"]), corners_of(target["boxes"])
     true_labels = torch.as_tensor(target["labels"]).cpu()
     values = []
     for name in true_labels.unique().tolist():
@@ -60,7 +60,7 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
     check_prediction(prediction)
     if isinstance(prediction, dict):
         keep = prediction["scores"] >= _CONFIDENT
-        boxes = prediction["boxes"][keep].detach()
+        boxes = corners_of(prediction["boxes"])[keep.cpu()].to(keep.device)
         if len(boxes) and ((boxes >= 0) & (boxes <= 1)).all():
             raise ValueError("boxes must be in px, got all in [0, 1]; multiply them by the size of the image")
         options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}

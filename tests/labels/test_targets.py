@@ -430,6 +430,9 @@ def test_empty_boxes_masks_and_keypoints_stay_empty():
     warped = warp_labels(sample, SHIFT)
     for key, leaf in sample.items():
         assert (type(warped[key]), warped[key].shape, warped[key].dtype) == (type(leaf), leaf.shape, leaf.dtype)
+    sample["boxes"] = tv.BoundingBoxes([], format="XYXY", canvas_size=SIZE)  # (1, 0), which torchvision passes on
+    warped = warp_labels(sample, SHIFT)
+    assert [tuple(warped[key].shape) for key in ("boxes", "labels", "points")] == [(1, 0), (0,), (0, 17, 2)]
 
 
 def test_gradients_of_rotated_boxes_are_those_of_finite_differences(wave):

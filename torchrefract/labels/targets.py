@@ -169,7 +169,7 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
     if is_zero is not None and eager_values(is_zero.any, of=is_zero) is not False:
         warped = [_restore_unmoved(leaf, one, is_zero) for leaf, one in zip(leaves, warped, strict=True)]
     values = [one.value for one in warped]
-    boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes")]
+    boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes") and leaf.shape != (1, 0)]
     for i, one in enumerate(warped):
         if one.flags is not None and i not in boxes:
             _clear_visibility(values, leaves, _siblings(paths, i), one.flags)
@@ -259,6 +259,8 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if flow.ndim == 4:
         raise ValueError(f"target must be a list of samples if it holds boxes and flow is a batch, got {type(boxes)}")
     plain = boxes.as_subclass(Tensor)
+    if plain.shape == (1, 0):  # torchvision makes this of an empty list
+        return _Warped(boxes)
     if len(plain) == 0:
         return _Warped(boxes, torch.ones(0, dtype=torch.bool, device=plain.device))
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)

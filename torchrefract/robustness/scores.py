@@ -40,14 +40,14 @@ def segmentation_score(prediction: Tensor, target: Tensor) -> float:
         prediction: (K, H, W), a score of each class at each pixel, or (H, W), integers.
         target: (H, W) or (1, H, W), integers.
     """
-    check_prediction(prediction)
+    _check_classes(prediction)
     areas = class_areas(prediction, target).values()
     return sum(intersection / union for intersection, union in areas) / len(areas) if areas else 1.0
 
 
 def classification_score(prediction: Tensor, target: Tensor | int) -> float:
     """Return 1.0 if the class with the highest of the scores (K,) is the target, else 0.0."""
-    check_prediction(prediction)
+    _check_classes(prediction)
     return float(prediction.detach().cpu().argmax().item() == int(target))
 
 
@@ -81,11 +81,9 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         parts = [prediction.get(name) for name in ("boxes", "labels", "scores")]
         shapes = [part.shape if isinstance(part, Tensor) else None for part in parts]
         is_valid = shapes[1] is not None and len(shapes[1]) == 1 and shapes == [(*shapes[1], 4), shapes[1], shapes[1]]
-        fits, has_classes = isinstance(target, dict), True
+        fits = isinstance(target, dict)
     else:
         is_valid = isinstance(prediction, Tensor) and prediction.ndim in (1, 2, 3)
-        # The highest of the scores of one class is always that class.
-        has_classes = is_valid and (len(prediction) > 1 if prediction.ndim != 2 else not prediction.is_floating_point())
         size = prediction.shape[-2:] if is_valid and prediction.ndim > 1 else ()
         fits = not isinstance(target, dict) and getattr(target, "shape", ())[-2:] == size
     if not is_valid:
@@ -98,7 +96,12 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
             "predictions must have the kind and the size of the labels: boxes for boxes, a class of each pixel for a "
             f"mask, got {_described(prediction)} for {_described(target)}"
         )
-    if not has_classes:
+
+
+def _check_classes(prediction: Tensor) -> None:
+    """Raise ValueError unless a prediction has a class: the highest of the scores of one class is always that class."""
+    check_prediction(prediction)
+    if prediction.is_floating_point() if prediction.ndim == 2 else len(prediction) == 1:
         raise ValueError(
             "predictions must be scores of at least two classes, (K, H, W) or (K,), or classes (H, W), integers, got "
             f"{_described(prediction)}; one logit x is the scores -x and x, one probability p is 1 - p and p"

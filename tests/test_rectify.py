@@ -143,6 +143,17 @@ def test_a_folder_of_another_camera_is_rejected(call, folder):
     assert message == "out must be a folder of the same camera and zoom, got out with another camera.yaml"
 
 
+def test_pictures_of_one_name_in_another_folder_are_not_taken_for_rectified_ones(call, folder):
+    assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
+    (folder / "other").mkdir()
+    cv2.imwrite(str(folder / "other" / "0.png"), 255 - waves())
+    message = call("rectify", "input=other", "camera=cam.yaml", "out=out").message
+    assert message == (
+        f"out must be a folder of the same configuration, got out, where input is {folder / 'raw'} there and "
+        f"{folder / 'other'} here; choose another folder"
+    )
+
+
 def test_smaller_frames_use_the_resized_camera(call, folder):
     small = cv2.resize(waves(), (48, 32), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(folder / "small.png"), small)

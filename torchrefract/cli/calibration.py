@@ -54,6 +54,7 @@ from torchrefract.data.images import (
     pixels_of,
     read_image,
 )
+from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
@@ -286,9 +287,10 @@ def rectify(cfg: DictConfig) -> None:
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
     files = media.find_media(source)
-    with naming("out"):
-        out.mkdir(parents=True, exist_ok=True)
     media.check_output_folder(out, source)
+    folder = source if source.is_dir() else source.parent
+    with naming("out"):
+        claim(out, {"input": str(folder.resolve())}, count=0, about={})
     for path, content in ((out / "lens.yaml", camera), (out / CAMERA_FILE, pinhole)):
         _write_camera(path, content)
     if not exists.all():

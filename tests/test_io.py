@@ -37,7 +37,10 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
 
 
 def test_an_error_of_writing_names_the_file(tmp_path):
-    with pytest.raises(OSError, match=r"No space left on device: '.*/panel.png'$"), replace_file(tmp_path / "panel.png"):
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*/panel.png'$"),
+        replace_file(tmp_path / "panel.png"),
+    ):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 

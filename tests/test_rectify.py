@@ -263,6 +263,7 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(ca
             "camera must be of the model opencv or fisheye for this file (convert(camera, to",
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom must be a number in [0.05, 20], got 0"),
+        (("input=raw", "camera=cam.yaml", "zoom=0.5", "crop=true"), "zoom must be at least 1 beside crop=true, which"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (
             ("input=wide.png", "camera=cam.yaml"),

@@ -278,7 +278,7 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
 def rectify(cfg: DictConfig) -> None:
     """Rectify pictures and videos that are not in the output folder yet, and write the camera of the results."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    zoom = read_option(cfg, "zoom", check_number, low=0.05, high=20.0)
+    zoom = _read_zoom(cfg)
     with naming("camera"):
         camera = read_camera(str(cfg.camera), name=cfg.camera_name)
         covariance = read_covariance(str(cfg.camera))
@@ -344,6 +344,16 @@ def rectify(cfg: DictConfig) -> None:
         f"results: {out}/{CAMERA_FILE}"
     )
     check_none_lost([str(error) for error in failed.values() if is_lost(error)])
+
+
+def _read_zoom(cfg: DictConfig) -> float:
+    """Return the option `zoom`; raise UsageError if `crop` would ignore it."""
+    zoom = read_option(cfg, "zoom", check_number, low=0.05, high=20.0)
+    if cfg.crop and zoom < 1:
+        raise UsageError(
+            f"zoom must be at least 1 beside crop=true, which never zooms out, got {zoom:g}; leave one of them out"
+        )
+    return zoom
 
 
 def _part_to_keep(

@@ -157,7 +157,12 @@ def test_pictures_of_one_name_in_another_folder_are_not_taken_for_rectified_ones
 def test_smaller_frames_use_the_resized_camera(call, folder):
     small = cv2.resize(waves(), (48, 32), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(folder / "small.png"), small)
-    assert call("rectify", "input=small.png", "camera=cam.yaml", "out=out").code == 0
+    outcome = call("rectify", "input=small.png", "camera=cam.yaml", "out=out")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "warning: out/camera.yaml is the camera of frames of 96 x 64 px; for those of 48 x 32 px scale its numbers, as "
+        "camera.resized does\n"
+    )
     theirs = cv2.remap(
         small.astype(np.float32), *maps(CAMERAS["opencv"].resized(width=48, height=32), 1.0), cv2.INTER_CUBIC
     )

@@ -223,10 +223,10 @@ class RestorationModule(LightningModule, ABC):
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
         for name, value in scores.items():
             pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
-            value = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
-            mean = value.mean() if len(value) else torch.zeros((), device=value.device)  # of weight 0
+            kept = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
+            mean = kept.mean() if len(kept) else torch.zeros((), device=value.device)  # of weight 0
             options = {"on_step": False, "on_epoch": True, "sync_dist": True}
-            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(value), **options)
+            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(kept), **options)
 
 
 class Restoration(RestorationModule):

@@ -234,6 +234,11 @@ class Degraded:
     def _read(self, name: str) -> Any:
         value = self._maps[name]
         if callable(value):
+            device = self.image.device.type
+            if device != "meta" and torch.is_autocast_enabled(device):
+                # Maps are computed when they are read, which may be inside of autocast, but positions need float32.
+                with torch.autocast(device, enabled=False):
+                    return self._read(name)
             value = self._maps[name] = value(self)
         return value
 

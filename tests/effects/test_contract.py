@@ -651,6 +651,9 @@ def test_wrong_seeds_keys_and_depths_raise(case):
     wrong: list[tuple[dict[str, Any], type[Exception], str]] = [
         ({"keys": [1, 2, 3]}, ValueError, "keys must have one key for each of the 2 images"),
         ({"keys": torch.zeros(2)}, TypeError, "keys must be whole numbers"),
+        ({"keys": ["a.jpg", "b.jpg"]}, TypeError, r"keys must be a list of whole numbers .* got \['a.jpg'.*key_of"),
+        ({"keys": [2**63, 0]}, TypeError, r"keys must be a list of whole numbers in \[-2\^63, 2\^63\)"),
+        ({"keys": 3}, TypeError, "keys must be a list of whole numbers .* one for each of the 2 images, got 3"),
         ({"keys": torch.zeros(2, 1, dtype=torch.int64)}, ValueError, "keys must have one key for each"),
         ({"seed": 1.5}, TypeError, "seed must be a whole number"),
         ({"seed": True}, TypeError, "seed must be a whole number"),

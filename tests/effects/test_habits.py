@@ -150,6 +150,17 @@ def test_autocast_changes_nothing(effect):
     assert_close(result, effect.degrade(image, seed=7).image, rtol=0, atol=2e-4)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_maps_that_are_read_inside_autocast_are_those_outside(dtype):
+    image, effect = random_image(1, 3, 90, 160), tr.Compose([tr.Turbulence(), tr.LensDistortion()])
+    expected = effect.degrade(image, seed=7)
+    with torch.autocast("cpu", dtype=dtype):
+        result = effect.degrade(image, seed=7)
+        maps = result.flow, result.restore_flow, result.restore_residual
+    assert_close(maps, (expected.flow, expected.restore_flow, expected.restore_residual), rtol=0, atol=1e-4)
+    assert torch.equal(result.restore_valid, expected.restore_valid)
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
 def test_a_copy_of_a_model_degrades_like_the_model(effect, copied):
     model, image = nn.Sequential(nn.Conv2d(3, 3, 1), effect), random_frames(3, 3)

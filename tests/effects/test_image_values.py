@@ -62,6 +62,13 @@ def test_values_are_read_once_for_each_effect_and_shape(monkeypatch):
     assert len(calls) == 3
 
 
+def test_a_black_frame_does_not_stand_for_the_values_of_those_that_follow():
+    effect = UniformFog()
+    effect(torch.zeros(3, 20, 30))
+    with pytest.raises(ValueError, match=r"image must lie in \[0, 1\] if it is floating"):
+        effect(255 * photo(3, 20, 30))
+
+
 def test_a_clip_with_the_channels_before_the_frames_is_warned_of():
     with pytest.warns(
         UserWarning, match=r"taken for clips of 3 frames with 8 channels; use image\.movedim\(-4, -3\) if"
@@ -94,6 +101,19 @@ def test_a_clip_with_the_channels_before_the_frames_is_warned_of():
 def test_other_layouts_and_types_raise(image, error, message):
     with pytest.raises(error, match=message):
         UniformFog()(image)
+
+
+def test_labels_in_the_place_of_the_image_raise():
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra train")
+    mask = tv_tensors.Mask(torch.zeros(1, 48, 60, dtype=torch.uint8))
+    points = tv_tensors.KeyPoints(torch.rand(1, 3, 2), canvas_size=(48, 60))
+    for label in (mask, points):
+        with pytest.raises(
+            TypeError, match=rf"image must be an image, got {type(label).__name__} of torchvision; pass"
+        ):
+            UniformFog()(label, tv_tensors.Image(torch.rand(3, 48, 60)))
+        with pytest.raises(TypeError, match="image must be an image"):
+            UniformFog().degrade(label, seed=0)
 
 
 def test_a_picture_of_pillow_raises():

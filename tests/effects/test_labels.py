@@ -189,6 +189,16 @@ def test_a_sample_without_one_image_raises():
         PINCUSHION({"image": sample["image"].numpy(), "labels": sample["labels"]})
 
 
+@pytest.mark.parametrize("effect", [PINCUSHION, UniformFog()], ids=["lens", "fog"])
+def test_a_tensor_before_the_one_that_a_sample_names_as_its_image_is_not_taken_for_it(effect):
+    image = torch.rand(3, 64, 80)
+    for first in (torch.eye(3)[None], torch.rand(1, 64, 80)):
+        with pytest.raises(ValueError, match=r"must be the first tensor of a sample, .*, got 'matrix' before 'image'"):
+            effect({"matrix": first, "image": image})
+    assert not torch.equal(effect({"matrix": torch.eye(3)[None], "image": tv_tensors.Image(image)})["image"], image)
+    assert not torch.equal(effect({"image": image, "matrix": torch.eye(3)[None]})["image"], image)
+
+
 def test_plain_positions_raise_even_if_the_effect_does_not_apply():
     with pytest.raises(TypeError, match=r"target\['boxes'\] must be a BoundingBoxes of torchvision to move with the"):
         LensDistortion(p=0.0)(torch.rand(3, 40, 56), {"boxes": torch.zeros(2, 4)})

@@ -142,9 +142,13 @@ def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch(
                     compiled(images[limit])
 
 
-def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws():
-    model, image = nn.Sequential(nn.Conv2d(3, 3, 1), tr.ThinPlateSpline()).train(), random_image(2, 3, 24, 32)
-    exported = torch.export.export(model, (image,)).module()
+@pytest.mark.parametrize("effect", [tr.ThinPlateSpline(), tr.LensDistortion()], ids=["spline", "lens"])
+def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws(effect):
+    model, image = nn.Sequential(nn.Conv2d(3, 3, 1), effect).train(), random_image(2, 3, 24, 32)
+    file = io.BytesIO()
+    torch.export.save(torch.export.export(model, (image,)), file)
+    file.seek(0)
+    exported = torch.export.load(file).module()
     torch.manual_seed(3)
     expected = model(image)
     torch.manual_seed(3)

@@ -211,6 +211,16 @@ def test_boxes_below_the_limits_are_dropped():
     assert warped["boxes"].tolist() == [[10.0, 5.0, 30.0, 20.0], [-5.0, 20.0, 10.0, 30.0]]
 
 
+@pytest.mark.parametrize("form", PLAIN_FORMATS)
+def test_a_box_of_integers_that_rounding_leaves_no_area_is_dropped(form):
+    boxes = boxes_of([[2.0, 4.0, 12.0, 10.0], [30.0, 6.0, 50.0, 20.0]])
+    boxes = v2.functional.convert_bounding_box_format(boxes, new_format=form)
+    flow = torch.tensor([11.6, 0.0]).view(2, 1, 1).expand(2, *SIZE)  # 0.4 px of the first box stay in the frame
+    for dtype, labels in ((torch.float32, [7, 8]), (torch.int64, [8])):
+        sample = {"boxes": tv.wrap(boxes.as_subclass(Tensor).to(dtype), like=boxes), "labels": torch.tensor([7, 8])}
+        assert warp_labels(sample, flow)["labels"].tolist() == labels
+
+
 def test_drop_matches_the_sanitizer_of_torchvision():
     sample = detection()
     kept = warp_labels(sample, SHIFT, drop=False)
@@ -259,6 +269,31 @@ def test_all_rows_of_dropped_boxes_are_removed():
     assert all(warped[key] is value for key, value in of_image.items())
     assert warped["image"].shape == (3, *SIZE)
     assert warped["ids"] is other["ids"]
+
+
+def test_lists_with_a_dict_mask_or_tensor_for_each_box_lose_those_of_dropped_boxes():
+    sample, generated = detection(), generator()
+    points = [tv.KeyPoints(torch.rand(17, 2, generator=generated) * 20, canvas_size=SIZE) for _ in range(3)]
+    rows = {
+        "attributes": [{"occluded": 0, "parts": [1]}, {"occluded": 1}, {"occluded": 2}],
+        "tracks": (torch.tensor(5), torch.tensor(6), torch.tensor(7)),
+        "instances": [tv.Mask(mask) for mask in sample["masks"]],
+        "pose": [{"points": of, "visible": torch.ones(17)} for of in points],
+    }
+    others = {"cameras": [{"name": name} for name in "abc"], "pairs": [torch.arange(3), {"a": 1}, 7], "two": [{}, {}]}
+    warped = warp_labels(sample | rows | others, SHIFT)
+    assert warped["attributes"] == [{"occluded": 0, "parts": [1]}, {"occluded": 2}]
+    assert warped["tracks"] == (rows["tracks"][0], rows["tracks"][2])
+    assert all(map(torch.equal, warped["instances"], warped["masks"]))
+    for pose, expected in zip(warped["pose"], (points[0], points[2]), strict=True):
+        moved = warp_labels({"points": expected, "visible": torch.ones(17)}, SHIFT)
+        assert all(torch.equal(pose[name], moved[name]) for name in moved)
+    assert warped["cameras"] == others["cameras"]
+    assert warped["pairs"][0].tolist() == [0, 2]  # rows of a tensor, not entries of the list
+    assert (len(warped["pairs"]), len(warped["two"])) == (3, 2)
+    getter = warp_labels(sample | rows, SHIFT, labels_getter=lambda inputs: inputs["tracks"])
+    assert (len(getter["tracks"]), len(getter["attributes"]), len(getter["labels"])) == (2, 3, 3)
+    assert len(warp_labels(sample | rows, SHIFT, drop=False)["attributes"]) == 3
 
 
 def test_a_matrix_that_loses_rows_with_the_boxes_is_warned_of():
@@ -395,6 +430,9 @@ def test_empty_boxes_masks_and_keypoints_stay_empty():
     warped = warp_labels(sample, SHIFT)
     for key, leaf in sample.items():
         assert (type(warped[key]), warped[key].shape, warped[key].dtype) == (type(leaf), leaf.shape, leaf.dtype)
+    sample["boxes"] = tv.BoundingBoxes([], format="XYXY", canvas_size=SIZE)  # (1, 0), which torchvision passes on
+    warped = warp_labels(sample, SHIFT)
+    assert [tuple(warped[key].shape) for key in ("boxes", "labels", "points")] == [(1, 0), (0,), (0, 17, 2)]
 
 
 def test_gradients_of_rotated_boxes_are_those_of_finite_differences(wave):

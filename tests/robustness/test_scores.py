@@ -2,6 +2,8 @@ from typing import Any
 
 import pytest
 import torch
+from torchvision import tv_tensors
+from torchvision.transforms.v2.functional import convert_bounding_box_format
 
 from torchrefract.robustness.scores import (
     as_labels,
@@ -10,6 +12,7 @@ from torchrefract.robustness.scores import (
     detection_score,
     segmentation_score,
 )
+from torchrefract.robustness.set_scores import set_scores, summarize
 
 pytestmark = pytest.mark.quick
 
@@ -98,3 +101,44 @@ def test_a_prediction_that_does_not_fit_its_labels_raises(valid, prediction, mes
     check_prediction(*valid)
     with pytest.raises(ValueError, match=message):
         check_prediction(prediction, valid[1])
+
+
+@pytest.mark.parametrize(
+    ("score", "prediction", "target"),
+    [
+        (segmentation_score, torch.rand(1, 4, 5), torch.zeros(4, 5).long()),
+        (segmentation_score, torch.ones(1, 4, 5).long(), torch.zeros(4, 5).long()),
+        (segmentation_score, torch.rand(4, 5), torch.zeros(4, 5).long()),
+        (classification_score, torch.rand(1), 0),
+    ],
+)
+def test_one_score_of_two_classes_raises_as_its_highest_class_never_changes(score, prediction, target):
+    with pytest.raises(
+        ValueError, match=r"at least two classes, .*, got a tensor .*; one logit x is the scores -x and x"
+    ):
+        score(prediction, target)
+
+
+@pytest.mark.parametrize(
+    ("prediction", "message"),
+    [
+        (torch.rand(2, 2, 3), r"size of the image, \(4, 5\), got a tensor \(2, 2, 3\); resize the scores of classes"),
+        (BOXES | {"boxes": torch.tensor([[0.1, 0.2, 0.5, 0.9]] * 2), "scores": torch.ones(2)}, "boxes must be in px"),
+    ],
+)
+def test_predictions_in_other_units_than_the_px_of_the_image_are_no_labels(prediction, message):
+    with pytest.raises(ValueError, match=message):
+        as_labels(prediction, (4, 5))
+
+
+@pytest.mark.parametrize("form", ["XYXY", "XYWH", "CXCYWH"])
+def test_boxes_of_torchvision_are_scored_by_their_format(form):
+    options: dict[str, Any] = {"format": "XYXY", "canvas_size": (40, 80)}
+    boxes = tv_tensors.BoundingBoxes(torch.tensor([[40.0, 20, 60, 30], [2, 4, 12, 24]]), **options)
+    converted = convert_bounding_box_format(boxes, new_format=form)
+    labels, scores = torch.tensor([1, 2]), torch.tensor([0.9, 0.8])
+    for predicted, expected in ((boxes.as_subclass(torch.Tensor), converted), (converted, boxes)):
+        prediction = {"boxes": predicted, "labels": labels, "scores": scores}
+        assert detection_score(prediction, {"boxes": expected, "labels": labels}) == 1
+        assert set_scores([summarize(prediction, {"boxes": expected, "labels": labels})])["mAP"] == pytest.approx(1)
+        assert torch.equal(as_labels(prediction, (40, 80))["boxes"], boxes)

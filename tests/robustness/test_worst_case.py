@@ -133,6 +133,11 @@ def test_invalid_arguments_raise(frames):
         worst_case(lambda image, _: image.mean(), nn.Identity(), frames)  # pyright: ignore[reportArgumentType]  # wrong
     with pytest.raises(TypeError, match="seed must be a whole number, got None"):
         worst_case(lambda image, _: image.mean(), UniformFog(), frames, seed=None)  # pyright: ignore[reportArgumentType]  # wrong
+    with (
+        torch.inference_mode(),
+        pytest.raises(RuntimeError, match=r"needs gradients, .* Trainer\(inference_mode=False"),
+    ):
+        worst_case(lambda image, _: image.mean(), UniformFog(), frames)
 
 
 @pytest.mark.quick

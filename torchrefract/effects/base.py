@@ -39,6 +39,7 @@ from torchrefract.effects.batch import (
 )
 from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.fields.depth import DepthSource, depth_of
+from torchrefract.labels.plain_values import name_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
 from torchrefract.labels.vehicles import LabeledBoxes, boxes_of_target
 from torchrefract.types import Degraded, Range
@@ -47,6 +48,7 @@ from torchrefract.warping.grid import field_dtype
 # Shapes and types of images whose values were checked, by effect: a call stores nothing on the module.
 _CHECKED_SHAPES: WeakKeyDictionary[nn.Module, set[Any]] = WeakKeyDictionary()
 _MAX_CHECKED_SHAPES = 64
+_IMAGE_NAMES = ("image", "images", "img", "imgs", "pixel_values")  # of the image in a sample that is a dict
 
 
 class Effect(nn.Module, ABC):
@@ -111,8 +113,9 @@ class Effect(nn.Module, ABC):
             if degraded.has("flow"):
                 check_kornia_keys()
             return result
-        leaves, spec = pytree.tree_flatten(image)
-        place = _find_image(leaves)
+        pairs, spec = pytree.tree_flatten_with_path(image)
+        leaves = [leaf for _, leaf in pairs]
+        place = _find_image(leaves, [name_of(path) for path, _ in pairs])
         result, degraded = self._degrade_like(leaves[place], (image,))
         marker = torch.empty((), dtype=torch.float32, device="cpu")  # stands for the image, which is not a label
         (moved,) = self._move_labels(
@@ -333,8 +336,7 @@ class Effect(nn.Module, ABC):
             return
         checked = _CHECKED_SHAPES.setdefault(self, set())
         kind = (image.shape, image.dtype)
-        if kind not in checked:
-            check_image_values(image)
+        if kind not in checked and not check_image_values(image):
             if len(checked) >= _MAX_CHECKED_SHAPES:
                 checked.clear()
             checked.add(kind)
@@ -394,8 +396,8 @@ def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEff
         frame = frame.f_back
 
 
-def _find_image(leaves: list[Any]) -> int:
-    """Return the index of the image among the leaves of a sample."""
+def _find_image(leaves: list[Any], names: list[str]) -> int:
+    """Return the index of the image among the leaves of a sample, whose names are those in their dict."""
     images = [k for k, leaf in enumerate(leaves) if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video")]
     if len(images) > 1:
         raise ValueError(
@@ -405,7 +407,14 @@ def _find_image(leaves: list[Any]) -> int:
     plain = [k for k, leaf in enumerate(leaves) if type(leaf) in (Tensor, nn.Parameter) or is_foreign_image(leaf)]
     if not images + plain:
         raise TypeError("image must be a tensor, or a sample with an Image of torchvision in it, got none")
-    return (images + plain)[0]
+    place = (images + plain)[0]
+    named = [k for k in plain if names[k] in _IMAGE_NAMES]
+    if not images and named and place not in named:
+        raise ValueError(
+            f"image must be the first tensor of a sample, or an Image of torchvision, got {names[place]!r} before "
+            f"{names[named[0]]!r}; wrap it as tv_tensors.Image(...)"
+        )
+    return place
 
 
 def _check_seed(seed: int | Tensor) -> int | Tensor:
@@ -421,10 +430,15 @@ def _check_seed(seed: int | Tensor) -> int | Tensor:
 def _check_keys(keys: Tensor | Sequence[int] | None, batch: int) -> Tensor | range:
     if keys is None:
         return range(batch)
-    # An empty list has no type of its own.
-    dtype = None if isinstance(keys, Tensor) or len(keys) else torch.int64
-    device = keys.device if isinstance(keys, Tensor) else "cpu"
-    keys = torch.as_tensor(keys, dtype=dtype, device=device)
+    if not isinstance(keys, Tensor):
+        try:
+            # An empty list has no type of its own.
+            keys = torch.as_tensor(keys, dtype=None if len(keys) else torch.int64, device="cpu")
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(
+                f"keys must be a list of whole numbers in [-2^63, 2^63), one for each of the {batch} images, got "
+                f"{keys!r:.60}; torchrefract.key_of gives that of a name"
+            ) from error
     if not is_whole(keys):
         raise TypeError(f"keys must be whole numbers, got {keys.dtype}")
     if keys.reshape(-1).shape[0] != batch or keys.ndim > 1:

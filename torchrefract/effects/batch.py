@@ -50,7 +50,7 @@ def check_image(image: Tensor) -> BatchShape:
 
     Raises:
         ValueError: another number of dimensions; no channel, no pixel or no frame.
-        TypeError: neither floating nor uint8; or `torch.jit.trace` runs.
+        TypeError: neither floating nor uint8; labels of torchvision; or `torch.jit.trace` runs.
     """
     if torch.jit.is_tracing():
         raise TypeError(
@@ -63,6 +63,11 @@ def check_image(image: Tensor) -> BatchShape:
             "v2.functional.to_image of torchvision, or place v2.ToImage() before the effect"
         )
     check_tensor("image", image)
+    if type(image) is not Tensor and any(is_tv_tensor(image, kind) for kind in ("Mask", "KeyPoints", "BoundingBoxes")):
+        raise TypeError(
+            f"image must be an image, got {type(image).__name__} of torchvision; pass labels after the image, as in "
+            "effect(image, mask)"
+        )
     if image.ndim not in (3, 4, 5) or 0 in image.shape[-3:]:
         raise ValueError(
             f"image must have shape (B, C, H, W), (C, H, W) or, for clips, (B, T, C, H, W), got {tuple(image.shape)}"
@@ -98,20 +103,20 @@ def is_foreign_image(value: Any) -> bool:
     return picture is not None and isinstance(value, picture)
 
 
-def check_image_values(image: Tensor) -> None:
+def check_image_values(image: Tensor) -> bool:
     """Raise ValueError for a floating image in 0...255, or after normalization, from a few of its pixels.
 
     An image may exceed [0, 1], as after bicubic interpolation or with highlights. The check fails if a quarter of the
     pixels lie above 1.5 or 5 % lie below -0.25; pixels of 0, as of a frame, do not count. It reads nothing where that
-    waits for a device or breaks a graph.
+    waits for a device or breaks a graph. Return True if the values are unknown: nothing was read, or all is 0.
     """
     if why_not_eager(image) is not None:
-        return
+        return True
     height, width = image.shape[-2:]
     pixels = image.detach()[..., :: -(-height // _CHECKED_PIXELS), :: -(-width // _CHECKED_PIXELS)]
     pixels = pixels[pixels.isfinite() & (pixels != 0)]
     if pixels.numel() == 0:
-        return
+        return True
     is_high, is_low = ((sign * pixels > limit).float().mean() > share for sign, limit, share in _LIMITS)
     if is_high or is_low:
         low, high = (value.item() for value in pixels.aminmax())
@@ -119,6 +124,7 @@ def check_image_values(image: Tensor) -> None:
             f"image must lie in [0, 1] if it is floating, got values from {low:.3g} to {high:.3g}; divide 0...255 by "
             "255 or pass uint8, and place effects before Normalize"
         )
+    return False
 
 
 def fix_frame_size(image: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """The lens of a cheap dashcam."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -331,7 +332,8 @@ class LensDistortion(WarpEffect):
         dtype = params.focal.dtype
         is_fixed = not (torch.is_grad_enabled() and requires_grad(params))
         details = self._constant_plan(id(self), height, width, dtype).details
-        with torch.set_grad_enabled(not is_fixed):
+        # torch.set_grad_enabled sets the mode twice, and torch.export.load cannot read the empty region in between.
+        with torch.no_grad() if is_fixed else nullcontext():
             coefficients, focal, center = map(Tensor.double, lens_in_px(params, height, width))
             lens = coefficients, focal, center
 

@@ -74,11 +74,11 @@ def warp_labels(
     keypoints are rounded.
 
     With `drop`, boxes below the limits are removed as by `SanitizeBoundingBoxes`, together with their rows of every
-    tensor, array and list that has as many rows as there are boxes, as labels, areas, keypoints and instance masks,
-    (N, H, W). They lie anywhere in the sample or, if it holds several `BoundingBoxes`, in the dict, list or tuple of
-    the boxes. Images stay as they are, and so do sizes and values whose name says that they belong to the image or to
-    the camera, as "image_id". `labels_getter` replaces this rule. Dropping reads values, so it waits for an
-    accelerator. Without `drop`, these boxes stay and have zero area.
+    tensor, array and list that has as many rows as there are boxes, as labels, areas, keypoints, instance masks,
+    (N, H, W), and lists of a dict, mask or tensor for each box. They lie anywhere in the sample or, if it holds several
+    `BoundingBoxes`, in the dict, list or tuple of the boxes. Images stay as they are, and so do sizes and values whose
+    name says that they belong to the image or to the camera, as "image_id". `labels_getter` replaces this rule.
+    Dropping reads values, so it waits for an accelerator. Without `drop`, these boxes stay and have zero area.
 
     A rotated box becomes the smallest box around its warped outline that has the direction of the warped top and bottom
     edges. An invisible keypoint gets its position off the canvas, or (-1, -1) if it has none. A plain tensor, array or
@@ -156,6 +156,12 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
     for i, (path, leaf) in enumerate(pairs):
         siblings = {name: leaves[k] for name, k in _siblings(paths, i).items()}
         check_moves(path, leaf, siblings, (flow.shape[-2], flow.shape[-1]))
+    counts = {leaf.shape[0] for leaf in leaves if is_tv_tensor(leaf, "BoundingBoxes")} if options.drop else set()
+    if counts:
+        pairs, spec = pytree.tree_flatten_with_path(
+            sample, is_leaf=lambda node: _is_plain_list(node) or _has_entries_of_boxes(node, counts)
+        )
+        paths, leaves = [path for path, _ in pairs], [leaf for _, leaf in pairs]
     is_zero = (flow == 0).flatten(-3).all(dim=-1) if options.keep_unmoved else None
     if is_zero is not None and eager_values(is_zero.all, of=is_zero):
         return sample
@@ -163,7 +169,7 @@ def _warp_sample(sample: Any, flow: Tensor, options: _Options) -> Any:
     if is_zero is not None and eager_values(is_zero.any, of=is_zero) is not False:
         warped = [_restore_unmoved(leaf, one, is_zero) for leaf, one in zip(leaves, warped, strict=True)]
     values = [one.value for one in warped]
-    boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes")]
+    boxes = [i for i, leaf in enumerate(leaves) if is_tv_tensor(leaf, "BoundingBoxes") and leaf.shape != (1, 0)]
     for i, one in enumerate(warped):
         if one.flags is not None and i not in boxes:
             _clear_visibility(values, leaves, _siblings(paths, i), one.flags)
@@ -184,13 +190,24 @@ def _is_plain_list(node: Any) -> bool:
     return type(node) in (list, tuple) and all(_is_plain_value(value) or _is_plain_list(value) for value in node)
 
 
+def _has_entries_of_boxes(node: Any, counts: set[int]) -> bool:
+    """Return True for a list or tuple, of one of these lengths, of dicts or tensors that may belong to a box each."""
+    if type(node) not in (list, tuple) or len(node) not in counts:
+        return False
+    if all(isinstance(entry, dict) for entry in node):
+        return not any(is_tv_tensor(leaf, "BoundingBoxes") for leaf in pytree.tree_leaves(node))
+    return all(isinstance(entry, Tensor) and _num_rows(entry) != len(node) for entry in node) and not any(
+        is_tv_tensor(entry, kind) for entry in node for kind in ("BoundingBoxes", "Image", "Video")
+    )
+
+
 def _is_plain_value(value: Any) -> bool:
     return isinstance(value, _PLAIN) and not isinstance(value, Tensor)
 
 
 def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
     """Replace the samples, () or (B,), whose flow is zero by the original ones."""
-    if warped.value is leaf:
+    if warped.value is leaf or isinstance(leaf, list | tuple):  # the entries of a list are restored one by one
         return warped
 
     def mask(value: Tensor) -> Tensor:
@@ -216,6 +233,8 @@ def _warp_leaf(leaf: Any, flow: Tensor, options: _Options) -> _Warped:
         return _warp_bounding_boxes(leaf, flow, options)
     if type(leaf) in (Tensor, torch.nn.Parameter) or _is_plain_value(leaf) or _is_plain_list(leaf):
         return _Warped(leaf)
+    if type(leaf) in (list, tuple):
+        return _Warped(type(leaf)(_warp_sample(entry, flow, options) for entry in leaf))
     kind = f"{type(leaf).__module__}.{type(leaf).__qualname__}"
     raise TypeError(f"target must hold tv_tensors of torchvision or plain values, got {kind}")
 
@@ -240,6 +259,8 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if flow.ndim == 4:
         raise ValueError(f"target must be a list of samples if it holds boxes and flow is a batch, got {type(boxes)}")
     plain = boxes.as_subclass(Tensor)
+    if plain.shape == (1, 0):  # torchvision makes this of an empty list
+        return _Warped(boxes)
     if len(plain) == 0:
         return _Warped(boxes, torch.ones(0, dtype=torch.bool, device=plain.device))
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
@@ -251,7 +272,9 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
         warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
-        warped = convert_boxes(warped + 0.5, "XYXY", boxes.format.name)
+        warped = _cast(convert_boxes(warped + 0.5, "XYXY", boxes.format.name), boxes.dtype)
+        size = warped[:, 2:] - warped[:, :2] if boxes.format.name == "XYXY" else warped[:, 2:]
+        keep = keep & (size > 0).all(dim=1)  # rounding can close a narrow box
     return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
 
 
@@ -305,8 +328,8 @@ def _rows_of_boxes(
     rows = [k for k in near if k not in boxes and _num_rows(leaves[k]) == count]
     rows = [k for k in rows if not is_tv_tensor(leaves[k], "Mask") or leaves[k].ndim > 2]
     if callable(labels_getter):
-        labels = labels_getter(sample)
-        labels = [] if labels is None else labels if isinstance(labels, list | tuple) else [labels]
+        given = labels_getter(sample)
+        labels = [] if given is None else [given, *given] if isinstance(given, list | tuple) else [given]
         chosen = [k for k, leaf in enumerate(leaves) if any(leaf is label for label in labels)]
         for k in chosen:
             _check_rows(leaves[k], count)

@@ -35,7 +35,7 @@ def boxes_of_target(target: Any) -> LabeledBoxes:
     pairs, _ = pytree.tree_flatten_with_path(target, is_leaf=lambda node: _classes(node) is not None)
     boxes, labels, is_labeled = list[Tensor](), list[int | str](), True
     for path, leaf in pairs:
-        if not is_tv_tensor(leaf, "BoundingBoxes"):
+        if not is_tv_tensor(leaf, "BoundingBoxes") or leaf.numel() == 0:
             continue
         boxes.append(_corners(leaf))
         nearby = [(other, _classes(value)) for other, value in pairs if other[:-1] == path[:-1] and value is not leaf]

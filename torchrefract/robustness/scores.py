@@ -7,7 +7,7 @@ from torch import Tensor
 from torchvision import tv_tensors
 from torchvision.ops import box_iou
 
-from torchrefract.robustness.set_scores import class_areas
+from torchrefract.robustness.set_scores import class_areas, corners_of
 
 _IOU = 0.5  # from which a box is found
 _CONFIDENT = 0.5  # score from which a detection counts as a label
@@ -20,10 +20,10 @@ def detection_score(prediction: dict[str, Tensor], target: dict[str, Any]) -> fl
 
     Args:
         prediction: `boxes` (n, 4), x1 y1 x2 y2 in px, `labels` (n,) and `scores` (n,), as of torchvision's detectors.
-        target: `boxes` (m, 4) and `labels` (m,).
+        target: `boxes` (m, 4) and `labels` (m,). Boxes of torchvision may have any format that is not rotated.
     """
-    boxes, labels, scores = (prediction[name].detach().cpu() for name in ("boxes", "labels", "scores"))
-    true_boxes = torch.as_tensor(target["boxes"]).cpu().as_subclass(Tensor).view(-1, 4)
+    labels, scores = (prediction[name].detach().cpu() for name in ("labels", "scores"))
+    boxes, true_boxes = corners_of(prediction["boxes"]), corners_of(target["boxes"])
     true_labels = torch.as_tensor(target["labels"]).cpu()
     values = []
     for name in true_labels.unique().tolist():
@@ -40,12 +40,14 @@ def segmentation_score(prediction: Tensor, target: Tensor) -> float:
         prediction: (K, H, W), a score of each class at each pixel, or (H, W), integers.
         target: (H, W) or (1, H, W), integers.
     """
+    _check_classes(prediction)
     areas = class_areas(prediction, target).values()
     return sum(intersection / union for intersection, union in areas) / len(areas) if areas else 1.0
 
 
 def classification_score(prediction: Tensor, target: Tensor | int) -> float:
     """Return 1.0 if the class with the highest of the scores (K,) is the target, else 0.0."""
+    _check_classes(prediction)
     return float(prediction.detach().cpu().argmax().item() == int(target))
 
 
@@ -58,11 +60,18 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
     check_prediction(prediction)
     if isinstance(prediction, dict):
         keep = prediction["scores"] >= _CONFIDENT
-        boxes = prediction["boxes"][keep].detach()
+        boxes = corners_of(prediction["boxes"])[keep.cpu()].to(keep.device)
+        if len(boxes) and ((boxes >= 0) & (boxes <= 1)).all():
+            raise ValueError("boxes must be in px, got all in [0, 1]; multiply them by the size of the image")
         options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
         return {"boxes": tv_tensors.BoundingBoxes(boxes, **options), "labels": prediction["labels"][keep].detach()}
     if prediction.ndim == 1:
         return int(prediction.argmax())
+    if tuple(prediction.shape[-2:]) != size:
+        raise ValueError(
+            f"predictions must have the size of the image, {size}, got {_described(prediction)}; resize the scores of "
+            "classes to it"
+        )
     return tv_tensors.Mask((prediction.argmax(dim=0) if prediction.ndim == 3 else prediction).detach())
 
 
@@ -86,6 +95,16 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         raise ValueError(
             "predictions must have the kind and the size of the labels: boxes for boxes, a class of each pixel for a "
             f"mask, got {_described(prediction)} for {_described(target)}"
+        )
+
+
+def _check_classes(prediction: Tensor) -> None:
+    """Raise ValueError unless a prediction has a class: the highest of the scores of one class is always that class."""
+    check_prediction(prediction)
+    if prediction.is_floating_point() if prediction.ndim == 2 else len(prediction) == 1:
+        raise ValueError(
+            "predictions must be scores of at least two classes, (K, H, W) or (K,), or classes (H, W), integers, got "
+            f"{_described(prediction)}; one logit x is the scores -x and x, one probability p is 1 - p and p"
         )
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import warn
+from torchrefract.labels.targets import convert_boxes, is_tv_tensor
 
 Summary = tuple[str, Any]
 
@@ -108,10 +109,17 @@ def _mean_average_precision(contents: Sequence[Any]) -> dict[str, float]:
     return {name: value if value >= 0 else float("nan") for name, value in values.items()}
 
 
+def corners_of(boxes: Any) -> Tensor:
+    """Return boxes as x1, y1, x2, y2, (n, 4), on the CPU: `BoundingBoxes` of torchvision by their format."""
+    plain = torch.as_tensor(boxes).detach().cpu().as_subclass(Tensor)
+    form = boxes.format.name if is_tv_tensor(boxes, "BoundingBoxes") else "XYXY"
+    return (plain if form == "XYXY" else convert_boxes(plain, form, "XYXY")).reshape(-1, 4)
+
+
 def _encode(boxes: Any, *columns: Any) -> str:
     """Encode boxes (n, 4) and columns (n,) as rows of float32."""
-    parts = [torch.as_tensor(part).detach().cpu().as_subclass(Tensor).float() for part in (boxes, *columns)]
-    rows = torch.cat([parts[0].reshape(-1, 4), *(part[:, None] for part in parts[1:])], dim=1)
+    parts = [torch.as_tensor(part).detach().cpu().as_subclass(Tensor).float()[:, None] for part in columns]
+    rows = torch.cat([corners_of(boxes).float(), *parts], dim=1)
     return base64.b64encode(rows.numpy().astype("<f4").tobytes()).decode("ascii")
 
 

@@ -75,6 +75,7 @@ def worst_case(
         TypeError: an image that is not floating; an effect or a seed of another type.
         ValueError: an argument out of range; an image that clearly is not in [0, 1]; an effect without random
             parameters, or a loss without a gradient.
+        RuntimeError: in `torch.inference_mode`.
     """
     steps, restarts = check_count("steps", steps), check_count("restarts", restarts)
     lr, seed = check_number("lr", lr, low=1e-6, high=1.0), check_whole("seed", seed)
@@ -82,6 +83,11 @@ def worst_case(
         raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
     if not check_tensor("image", image).is_floating_point():
         raise TypeError(f"image must be floating in [0, 1], got {image.dtype}; use image.float() / 255 for uint8")
+    if torch.is_inference_mode_enabled():
+        raise RuntimeError(
+            "worst_case needs gradients, which torch.inference_mode disables; call it outside of it, with Lightning by "
+            "Trainer(inference_mode=False)"
+        )
     image = image.detach()
     check_image(image)
     check_image_values(image)

@@ -54,10 +54,15 @@ def warp_boxes(
 
     Raises:
         ValueError: if shapes do not fit, x2 < x1 or y2 < y1 (checked on the CPU), or a limit is out of range.
-        TypeError: if an argument is not a tensor of real numbers.
+        TypeError: if an argument is not a tensor of real numbers, or `boxes` are `BoundingBoxes` of torchvision.
     """
     check_tensor("boxes", boxes)
     check_tensor("flow", flow)
+    if hasattr(boxes, "format"):
+        raise TypeError(
+            "boxes must be a plain tensor of x1, y1, x2, y2, got BoundingBoxes of torchvision, whose format and edges "
+            "differ; pass them to warp_labels"
+        )
     if boxes.ndim == 2 and flow.ndim == 3:
         limits = {"min_area": min_area, "min_visibility": min_visibility}
         warped, keep = warp_boxes(boxes[None], flow[None], clip=clip, samples=samples, **limits)

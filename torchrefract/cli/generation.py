@@ -303,8 +303,9 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     workers = 0 if options.engine["name"] == "ray" else min(1, options.workers)
     samples = [*map_in_processes(work, tasks, workers=workers, preload="torchrefract.data.pairs.generator")]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
-    if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
-        check_none_lost(lost if len(lost) == len(samples) else [], name="source")
+    lost = [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]
+    if len(lost) == len(samples):
+        check_none_lost(lost, name="source")
     mean = sum(sizes) // max(1, len(sizes))
     needed, free = mean * len(missing), None if is_remote(storage.out) else shutil.disk_usage(storage.out).free
     estimate = f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each"

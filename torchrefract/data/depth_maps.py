@@ -103,7 +103,7 @@ def write_map(path: Path, values: Tensor, *, lowest: int = 0) -> None:
     write_file(path, cv2.imencode(".png", levels)[1].tobytes(), alone=True)
 
 
-def map_levels(values: np.ndarray, *, lowest: int = 0) -> np.ndarray:
+def map_levels(values: np.ndarray, *, lowest: int) -> np.ndarray:
     """Return the levels of a PNG, uint16, in steps of 1/256, from the lowest one; 65535 stands for larger values."""
     return np.clip(np.rint(values.astype(float) / STEP), lowest, _LAST).astype(np.uint16)
 

@@ -242,7 +242,7 @@ def _write(path: Path, data: bytes) -> None:
 def _no_warnings() -> Iterator[None]:
     """Silence warnings of effects: the command warns of an assumed depth itself, and maps show folded pixels."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # both are said elsewhere
+        warnings.simplefilter("ignore", UserWarning)
         yield
 
 

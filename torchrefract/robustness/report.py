@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from torchrefract._io import replace_file, write_file
-from torchrefract._tensor import to_uint8
+from torchrefract.data.images import pixels_of
 from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
 
@@ -296,7 +296,7 @@ def _figure(example: Example) -> str:
 
 
 def _with_boxes(example: Example) -> Image.Image:
-    picture = _picture(example.image)
+    picture = Image.fromarray(pixels_of(example.image))
     draw = ImageDraw.Draw(picture)
     for name, boxes in (("labels", example.labels), ("predictions", example.predictions)):
         for box in [] if boxes is None else boxes.tolist():
@@ -308,7 +308,7 @@ def _with_classes(prediction: Classes) -> Image.Image:
     """Draw the classes of an image half-transparent over it."""
     palette = np.array([_class_color(i) for i in range(_NUM_COLORS)], np.uint8)
     colors = palette[prediction.classes.long().cpu().numpy() % _NUM_COLORS]
-    return Image.blend(_picture(prediction.image), Image.fromarray(colors), _OPACITY)
+    return Image.blend(Image.fromarray(pixels_of(prediction.image)), Image.fromarray(colors), _OPACITY)
 
 
 def _legend(*predictions: Tensor) -> str:
@@ -329,10 +329,6 @@ def _class_color(index: int) -> tuple[int, int, int]:
     # Neighbors of this map are pairs of a dark and a light color.
     red, green, blue = (round(255 * value) for value in colormaps["tab20"](2 * (index % 10) + index // 10)[:3])
     return red, green, blue
-
-
-def _picture(image: Tensor) -> Image.Image:
-    return Image.fromarray(to_uint8(image[None])[0].movedim(0, -1).cpu().numpy())
 
 
 def _jpeg(picture: Image.Image) -> str:

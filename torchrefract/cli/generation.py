@@ -68,7 +68,7 @@ from torchrefract.data.pairs.manifest import (
     scan_rows,
 )
 from torchrefract.data.pairs.ray_engine import check_cluster
-from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
+from torchrefract.data.pairs.sources import LIST, Sources, find_sources, read_sources
 from torchrefract.data.workers import map_in_processes
 
 _T = TypeVar("_T")
@@ -250,7 +250,7 @@ def _list_frames(
     cfg: DictConfig, source: Path, out: Path, settings: dict[str, Any]
 ) -> tuple[Sources, Callable[[], None]]:
     """Read the list of frames, or scan the source; return the frames and a function that writes a new list."""
-    path = list_path(out) if cfg.files is None else as_path(str(cfg.files))
+    path = out / LIST if cfg.files is None else as_path(str(cfg.files))
     options = {name: settings[name] for name in ("every", "drive_by", "val_share", "seed")}
     if path.is_file():
         # `claim` compares the options of a list in the folder of the set.

@@ -18,7 +18,7 @@ from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_siz
 from torchrefract.data.media import VIDEOS, video_info
 from torchrefract.random import key_of
 
-_LIST = "sources.parquet"
+LIST = "sources.parquet"  # the list in the folder of a set
 _SAMPLES = 16  # images whose headers are read before a set is started
 _BATCH = 10_000  # rows that are Python objects at a time
 
@@ -101,11 +101,6 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         shown = ", ".join(f"{name} is {previous.get(name)} there and {options[name]} here" for name in different)
         raise UsageError(f"files must be a list of the same options, got {path}, where {shown}; choose another folder")
     return Sources(root, table.replace_schema_metadata(), skipped)
-
-
-def list_path(out: Path) -> Path:
-    """Return the path of the list of a set."""
-    return out / _LIST
 
 
 def find_sources(

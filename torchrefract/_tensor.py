@@ -225,8 +225,5 @@ def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
 @assume_constant_result
 def _rounds_factors(device: str) -> bool:
     backends: Any = torch.backends
-    matmul = getattr(backends.mkldnn if device == "cpu" else backends.cuda, "matmul", None)
-    precision = getattr(matmul, "fp32_precision", None)
-    if precision is None:  # before PyTorch 2.9
-        return torch.get_float32_matmul_precision() != "highest"
+    precision = (backends.mkldnn if device == "cpu" else backends.cuda).matmul.fp32_precision
     return (backends.fp32_precision if precision == "none" else precision) not in ("none", "ieee")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import segmentation_models_pytorch as smp
 import timm
@@ -93,7 +93,7 @@ class CoordConvSegmenter(nn.Module):
         for parameter in self.network.segmentation_head.parameters():
             nn.init.zeros_(parameter)
         self.polynomial_head = PolynomialFlowHead(self.network.encoder.out_channels[-1], channels) if smooth else None
-        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+        self.to(memory_format=torch.channels_last)
         self.train()
 
     def train(self, mode: bool = True) -> "CoordConvSegmenter":
@@ -238,7 +238,7 @@ def _add_coordinate_inputs(encoder: nn.Module, *, start_at_zero: bool) -> None:
     stem = next(module for module in encoder.modules() if isinstance(module, nn.Conv2d))
     inputs = _CoordinateInputs(stem.weight.detach(), start_at_zero=start_at_zero)
     parametrize.register_parametrization(stem, "weight", inputs, unsafe=True)  # unsafe: the shape changes
-    stem.in_channels = cast(Tensor, stem.weight).shape[1]
+    stem.in_channels = stem.weight.shape[1]
 
 
 def _find_weights(encoder: str, pretrained: str) -> tuple[Path, list[float], list[float]]:

@@ -64,7 +64,7 @@ from torchrefract.cameras.calibration.plumb_line import (
 from torchrefract.cameras.calibration.report import straightness, undistort_views
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.calibration import find_pictures, read_gray
-from torchrefract.cli.lens import Predictor, flow_predictor
+from torchrefract.cli.estimation import Predictor, flow_predictor
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes

@@ -25,8 +25,8 @@ from torchrefract._io import as_path, file_digest, make_folder, matching_files, 
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
-from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.cli.options import (
     check_seed,
     find_device,

@@ -119,7 +119,7 @@ def write_report(
         title: one line.
         loss, comparison: as for `write_tables`.
     """
-    names = list(result.set_scores[None])
+    names, rows = list(result.set_scores[None]), result.rows()
     worst = ["worst case"] if result.worst_case else []
     together = f" For {' and '.join(names)}, all images count together." if names else ""
     parts = [
@@ -128,7 +128,7 @@ def write_report(
         "is the mean over scenes and severities, rPC its share of the clean score.</p>",
         _table(["", "clean", "95 % interval", "mPC", "rPC"], _summary_cells(result)),
         *(
-            f'<img alt="{name} by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result, name))}">'
+            f'<img alt="{name} by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result, rows, name))}">'
             for name in ["score", *names[:1]]
         ),
         f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}. An open "
@@ -137,7 +137,7 @@ def write_report(
         "<h2>Scores</h2>",
         _table(
             ["scene", "severity", "score", "95 % interval", "drop", *worst, *names, "quantity"],
-            map(_score_cells, result.rows()),
+            map(_score_cells, rows),
         ),
     ]
     if worst:
@@ -207,20 +207,20 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _curves(result: Robustness, of: str) -> bytes:
+def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
     """Draw the score, with intervals, or one of all images together."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
     scenes = list(dict.fromkeys(level.scene for level in result.scores))
     for i, scene in enumerate(scenes):
-        rows = [row for row in result.rows() if row.scene == scene]
+        of_scene = [row for row in rows if row.scene == scene]
         shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
-        x = [row.severity + shift for row in rows]
+        x = [row.severity + shift for row in of_scene]
         if of == "score":
-            y = np.array([row.score for row in rows])
+            y = np.array([row.score for row in of_scene])
             axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
         else:
-            axes.plot(x, [row.set_scores[of] for row in rows], marker="o", label=scene)
+            axes.plot(x, [row.set_scores[of] for row in of_scene], marker="o", label=scene)
     clean = float(result.clean.mean()) if of == "score" else result.set_scores[None][of]
     axes.axhline(clean, color="gray", linestyle="--", label="clean")
     axes.set(xlabel="severity", ylabel=of, ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores}))

@@ -68,10 +68,8 @@ class Sources(NamedTuple):
         Raises:
             UsageError: a frame has none, or two frames share one.
         """
-        depth.check((frame.path, frame.frame) for frame in self.frames())
         digest = hashlib.sha256()
-        for frame in self.frames():
-            path = depth.find(frame.path, frame.frame)
+        for path in depth.check((frame.path, frame.frame) for frame in self.frames()):
             digest.update(ascii([path.name, depth.size_bytes(path)]).encode())
         return digest.hexdigest()
 

@@ -52,8 +52,9 @@ def cached_constant(*, maxsize: int) -> Callable[[_F], _F]:
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
-    """Return a context without autocast, which the device `meta` does not have."""
-    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
+    """Return a context without autocast. It does nothing where autocast is off, and so adds nothing to an export."""
+    is_enabled = device.type != "meta" and torch.is_autocast_enabled(device.type)  # PyTorch raises for "meta"
+    return torch.autocast(device.type, enabled=False) if is_enabled else nullcontext()
 
 
 @contextmanager

@@ -53,6 +53,20 @@ def test_a_masked_mean_is_the_mean_over_valid_pixels_and_0_without_any(pair, lef
     assert masked_mean(pair[0], ~everywhere).tolist() == [0, 0, 0]
 
 
+@pytest.mark.quick
+def test_a_score_of_an_image_without_a_valid_pixel_is_nan(pair, left):
+    restored, clean = pair
+    left[1] = False
+    flows = torch.zeros(2, 3, 2, *SIZE)
+    for score in (
+        psnr(restored, clean, left),
+        ssim(restored, clean, left),
+        endpoint_error(*flows, left, size=SIZE),
+        coverage(flows[0], flows[0], flows[1], left),
+    ):
+        assert score.isnan().tolist() == [False, True, False]
+
+
 def test_psnr_agrees_with_torchmetrics_on_the_valid_pixels_of_each_image(pair, left):
     restored, clean = pair
     expected = [

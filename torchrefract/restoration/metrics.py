@@ -1,4 +1,4 @@
-"""Scores of a restoration: one number an image, over the valid pixels only."""
+"""Scores of a restoration: one number an image, over the valid pixels only; NaN for an image that has none."""
 
 import torch
 from kornia.metrics import ssim as ssim_map
@@ -24,12 +24,17 @@ def masked_mean(value: Tensor, valid: Tensor) -> Tensor:
     return (value * weight).sum(dim=(1, 2, 3)) / count.clamp(min=1)
 
 
+def _score(value: Tensor, valid: Tensor) -> Tensor:
+    """Return `masked_mean`, but NaN for an image without a valid pixel, which has no score."""
+    return masked_mean(value, valid).where(valid.flatten(1).any(dim=1), torch.nan)
+
+
 def psnr(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
     """Compute the peak signal-to-noise ratio (B,), dB, of images (B, C, H, W) in [0, 1].
 
     psnr = 10 log10(1 / mean (clamp(restored, 0, 1) - clean)^2), at most 100 dB
     """
-    error = masked_mean((restored.clamp(0, 1) - clean).square(), valid)
+    error = _score((restored.clamp(0, 1) - clean).square(), valid)
     return -10 * torch.log10(error.clamp(min=1e-10))
 
 
@@ -60,7 +65,7 @@ def ssim(restored: Tensor, clean: Tensor, valid: Tensor) -> Tensor:
 
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 13 (2004).
     """
-    return masked_mean(ssim_map(torch.where(valid, restored.clamp(0, 1), clean), clean, window_size=11), valid)
+    return _score(ssim_map(torch.where(valid, restored.clamp(0, 1), clean), clean, window_size=11), valid)
 
 
 def endpoint_error(flow: Tensor, target: Tensor, valid: Tensor, *, size: tuple[int, int]) -> Tensor:
@@ -73,7 +78,7 @@ def endpoint_error(flow: Tensor, target: Tensor, valid: Tensor, *, size: tuple[i
     """
     scale = [size[1] / flow.shape[3], size[0] / flow.shape[2]]
     difference = (flow - target) * torch.tensor(scale, dtype=flow.dtype, device=flow.device).view(1, 2, 1, 1)
-    return masked_mean(difference.square().sum(dim=1, keepdim=True).sqrt(), valid)
+    return _score(difference.square().sum(dim=1, keepdim=True).sqrt(), valid)
 
 
 def coverage(flow: Tensor, deviation: Tensor, target: Tensor, valid: Tensor) -> Tensor:
@@ -81,4 +86,4 @@ def coverage(flow: Tensor, deviation: Tensor, target: Tensor, valid: Tensor) -> 
 
     It is 0.95 for a normal distribution with this deviation.
     """
-    return masked_mean(((flow - target).abs() <= 2 * deviation).to(flow), valid)
+    return _score(((flow - target).abs() <= 2 * deviation).to(flow), valid)

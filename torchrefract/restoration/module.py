@@ -110,7 +110,7 @@ class RestorationModule(LightningModule, ABC):
                 f"for the keys {keys}"
             )
         scores = {} if restored is None else _main_scores(restored, batch, self.metric_size)
-        self._log("train", {"loss": loss} | scores, batch)
+        self._log("train", {"loss": loss.expand(len(batch.clean))} | scores, batch)
         flows = torch.cat([batch.flow * batch.valid, batch.valid], dim=1).sum(dim=0, dtype=torch.float64)
         self.new_flows = _add(self.new_flows, flows)
         return loss
@@ -119,7 +119,7 @@ class RestorationModule(LightningModule, ABC):
         """Log the scores of the model and of the baselines; return the restoration as a dict."""
         _check_pair(batch)
         loss, restored = self.validation_loss(batch)
-        self._log("val", {"loss": loss}, batch)
+        self._log("val", {"loss": loss.expand(len(batch.clean))}, batch)
         clear = None if restored.transmission is None else torch.ones_like(restored.transmission)
         methods = {"": restored, "_identity": Restored(batch.degraded, transmission=clear)}
         if restored.flow is not None:
@@ -221,8 +221,12 @@ class RestorationModule(LightningModule, ABC):
         self.flows = torch.cat(checkpoint["flows"])
 
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
-        values = {f"{split}/{name}{suffix}": value.mean() for name, value in scores.items()}
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch.clean), sync_dist=True)
+        for name, value in scores.items():
+            pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
+            value = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
+            mean = value.mean() if len(value) else torch.zeros((), device=value.device)  # of weight 0
+            options = {"on_step": False, "on_epoch": True, "sync_dist": True}
+            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(value), **options)
 
 
 class Restoration(RestorationModule):

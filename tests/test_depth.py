@@ -153,6 +153,14 @@ def test_the_scale_makes_a_network_agree_with_the_road_and_the_sky_infinite():
     assert_close(trusted[known], 2 * depth[known])
 
 
+def test_an_image_of_uint8_has_the_depth_of_a_floating_one(network):
+    provider = from_transformers(network("metric"), scale="model")
+    image = roads(1, 90, 160)[0][0]
+    pixels = (image * 255).round().byte()
+    assert sky_mask(pixels).any()
+    assert_close(provider(pixels), provider(pixels / 255))
+
+
 def test_a_scale_that_the_road_contradicts_raises_with_the_remedy():
     image = torch.rand(2, 3, 40, 60)
     noise = torch.exp(torch.randn(2, 1, 40, 60, generator=torch.Generator().manual_seed(0))) * 10

@@ -1,3 +1,4 @@
+import errno
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,14 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
         fail()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_writing_names_the_file(tmp_path):
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*/panel.png'$"),
+        replace_file(tmp_path / "panel.png"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_a_report_may_hold_names_of_files_that_are_no_unicode(tmp_path):

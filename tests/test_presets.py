@@ -190,9 +190,12 @@ def test_lamps_shine_through_fog_at_night_in_a_glow():
     day = torch.full((1, 3, 90, 160), 0.7)
     day[:, :, 60:] = 0.3
     day[:, :, 70:73, 80:83] = 1.0
-    bright = presets.night_fog(4).degrade(day, seed=1, depth=depth)
-    assert bright.intensity.max() == 0
-    assert (bright.image[..., 71, 81] < 0.95).all()
+    road = torch.full((1, 3, 90, 160), 0.45)  # by day, seen from above, with its paint
+    road[:, :, 70:73, 80:83] = 1.0
+    for frame, distance in ((day, depth), (road, depth / 6)):
+        bright = presets.night_fog(4).degrade(frame, seed=1, depth=distance)
+        assert bright.intensity.max() == 0
+        assert (bright.image[..., 71, 81] < 0.95).all()
 
 
 def test_severities_of_heat_haze_have_the_documented_cn2():

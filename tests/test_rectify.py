@@ -143,10 +143,26 @@ def test_a_folder_of_another_camera_is_rejected(call, folder):
     assert message == "out must be a folder of the same camera and zoom, got out with another camera.yaml"
 
 
+def test_pictures_of_one_name_in_another_folder_are_not_taken_for_rectified_ones(call, folder):
+    assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
+    (folder / "other").mkdir()
+    cv2.imwrite(str(folder / "other" / "0.png"), 255 - waves())
+    message = call("rectify", "input=other", "camera=cam.yaml", "out=out").message
+    assert message == (
+        f"out must be a folder of the same configuration, got out, where input is {folder / 'raw'} there and "
+        f"{folder / 'other'} here; choose another folder"
+    )
+
+
 def test_smaller_frames_use_the_resized_camera(call, folder):
     small = cv2.resize(waves(), (48, 32), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(folder / "small.png"), small)
-    assert call("rectify", "input=small.png", "camera=cam.yaml", "out=out").code == 0
+    outcome = call("rectify", "input=small.png", "camera=cam.yaml", "out=out")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "warning: out/camera.yaml is the camera of frames of 96 x 64 px; for those of 48 x 32 px scale its numbers, as "
+        "camera.resized does\n"
+    )
     theirs = cv2.remap(
         small.astype(np.float32), *maps(CAMERAS["opencv"].resized(width=48, height=32), 1.0), cv2.INTER_CUBIC
     )
@@ -252,6 +268,7 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_rectified_by_the_next(ca
             "camera must be of the model opencv or fisheye for this file (convert(camera, to",
         ),
         (("input=raw", "camera=cam.yaml", "zoom=0"), "zoom must be a number in [0.05, 20], got 0"),
+        (("input=raw", "camera=cam.yaml", "zoom=0.5", "crop=true"), "zoom must be at least 1 beside crop=true, which"),
         (("input=raw", "camera=cam.yaml", "out=raw"), "out must be another folder than that of input, got raw"),
         (
             ("input=wide.png", "camera=cam.yaml"),

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_choice, check_positive, check_rgb
+from torchrefract._tensor import to_float
+from torchrefract._validation import check_choice, check_positive, check_rgb, is_whole
 from torchrefract.effects.batch import per_sample
 from torchrefract.fields.depth import DepthProvider, GroundPlaneDepth, check_depth
 from torchrefract.fields.sky import sky_mask
@@ -64,7 +65,7 @@ class ScaledDepth(NamedTuple):
 
 
 class TransformersDepth:
-    """A network of the transformers library as a function from images (B, 3, H, W) in [0, 1] to depth in m.
+    """A network of the transformers library as a function from images (B, 3, H, W), in [0, 1] or uint8, to depth in m.
 
     Pass it as `depth=` to a fog, or to `degrade`. The network runs without gradients. See `from_transformers`.
     """
@@ -92,7 +93,7 @@ class TransformersDepth:
             ValueError: not three channels; an output of the network that is not in m, see `check_depth`.
         """
         check_rgb("image", image)
-        image = image.detach().float()
+        image = to_float(image) if is_whole(image) else image.detach().float()
         depth, is_sky = self._predict(image), sky_mask(image)
         check_depth(depth, name="output of the model")
         scaled = torch.where(is_sky, torch.inf, depth)

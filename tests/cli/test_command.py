@@ -178,6 +178,19 @@ def test_any_name_of_a_file_reaches_the_configuration_of_each_command(name, tmp_
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize("name", FILE_OPTIONS)
+def test_a_path_that_begins_with_a_tilde_lies_in_the_home_folder(name, monkeypatch):
+    monkeypatch.setenv("HOME", "/users/me")
+    for option in FILE_OPTIONS[name][0]:
+        for flags, values, expected in (
+            ([], "~/drive.x", "'/users/me/drive.x'"),
+            (["-m"], "~/a.x,~/b.x", "'/users/me/a.x','/users/me/b.x'"),
+        ):
+            words = prepare_arguments(name, [f"{option}={values}", *FILE_OPTIONS[name][1], *flags])
+            assert words[0] == f"{option}={expected}"
+
+
+@pytest.mark.quick
 def test_a_value_that_is_text_is_quoted_unless_it_is_quoted_or_an_interpolation(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for word, expected in (

@@ -484,6 +484,14 @@ def test_a_folder_that_cannot_be_read_is_one_line_of_error(tmp_path, monkeypatch
         find_media(tmp_path, deep=deep, name="source")
 
 
+def test_a_folder_of_folders_is_an_error_that_says_so_where_they_are_not_searched(tmp_path):
+    (tmp_path / "drive").mkdir()
+    Image.fromarray(page()).save(tmp_path / "drive" / "a.png")
+    with pytest.raises(UsageError, match=f"got .*{tmp_path.name}, whose folders are not searched; give one of them$"):
+        find_media(tmp_path)
+    assert find_media(tmp_path, deep=True) == [tmp_path / "drive" / "a.png"]
+
+
 def test_sixteen_bits_are_kept(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 65536, (6, 8, 3)).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), pixels)

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -54,6 +54,7 @@ from torchrefract.data.images import (
     pixels_of,
     read_image,
 )
+from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
@@ -277,7 +278,7 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
 def rectify(cfg: DictConfig) -> None:
     """Rectify pictures and videos that are not in the output folder yet, and write the camera of the results."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    zoom = read_option(cfg, "zoom", check_number, low=0.05, high=20.0)
+    zoom = _read_zoom(cfg)
     with naming("camera"):
         camera = read_camera(str(cfg.camera), name=cfg.camera_name)
         covariance = read_covariance(str(cfg.camera))
@@ -286,20 +287,20 @@ def rectify(cfg: DictConfig) -> None:
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
     files = media.find_media(source)
-    with naming("out"):
-        out.mkdir(parents=True, exist_ok=True)
-    media.check_output_folder(out, source)
-    for path, content in ((out / "lens.yaml", camera), (out / CAMERA_FILE, pinhole)):
-        _write_camera(path, content)
+    _claim_for_cameras(out, source, {"lens.yaml": camera, CAMERA_FILE: pinhole})
     if not exists.all():
         share = 1 - exists.double().mean().item()
         print_warning(f"the camera's model folds back inside the frame: {share:.1%} of it stays black")
     for message in filter(None, (media.describe_turned(files), *media.describe_losses(files, upright=False))):
         print_warning(message)
 
+    sizes = set[tuple[int, int]]()
+
     @lru_cache(maxsize=2)
     def flow(height: int, width: int) -> Tensor:
-        return camera_flow(camera.resized(width=width, height=height), zoom=zoom)[0]
+        result = camera_flow(camera.resized(width=width, height=height), zoom=zoom)[0]
+        sizes.add((width, height))
+        return result
 
     def rectify_frame(frame: Tensor) -> Tensor:
         """Rectify a frame (1, 3, H, W) in [0, 1] to (3, H, W)."""
@@ -337,11 +338,22 @@ def rectify(cfg: DictConfig) -> None:
     if len(failed) == len(files):
         raise UsageError(f"input must hold a file that can be rectified, got {next(iter(failed.values()))}")
     num_existing = len(files) - len(failed) - num_written
+    _warn_of_other_sizes(sizes, camera, out / CAMERA_FILE)
     print(
         f"{out}: {num_written} rectified, {num_existing} already existed, {len(failed)} skipped; camera of the "
         f"results: {out}/{CAMERA_FILE}"
     )
     check_none_lost([str(error) for error in failed.values() if is_lost(error)])
+
+
+def _read_zoom(cfg: DictConfig) -> float:
+    """Return the option `zoom`; raise UsageError if `crop` would ignore it."""
+    zoom = read_option(cfg, "zoom", check_number, low=0.05, high=20.0)
+    if cfg.crop and zoom < 1:
+        raise UsageError(
+            f"zoom must be at least 1 beside crop=true, which never zooms out, got {zoom:g}; leave one of them out"
+        )
+    return zoom
 
 
 def _part_to_keep(
@@ -358,6 +370,26 @@ def _part_to_keep(
         elif cfg.crop and deviation > MAX_DEVIATION_PX:
             return crop, pinhole.cropped(**crop._asdict())
     return None, pinhole
+
+
+def _claim_for_cameras(out: Path, source: Path, cameras: Mapping[str, Camera]) -> None:
+    """Create the output folder with the files of cameras; raise UsageError if it is of another input or camera."""
+    media.check_output_folder(out, source)
+    folder = source if source.is_dir() else source.parent
+    with naming("out"):
+        claim(out, {"input": str(folder.resolve())}, count=0, about={})
+    for name, camera in cameras.items():
+        _write_camera(out / name, camera)
+
+
+def _warn_of_other_sizes(sizes: Iterable[tuple[int, int]], camera: Camera, path: Path) -> None:
+    """Warn of frames, of sizes (width, height), that are not of the size that the file with their camera states."""
+    others = [f"{w} x {h}" for w, h in sorted(sizes) if (w, h) != (camera.width, camera.height)]
+    if others:
+        print_warning(
+            f"{path} is the camera of frames of {camera.width} x {camera.height} px; for those of {', '.join(others)} "
+            "px scale its numbers, as camera.resized does"
+        )
 
 
 def _write_camera(path: Path, camera: Camera) -> None:

@@ -147,13 +147,15 @@ def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
 def quote_text(override: str, *, is_multirun: bool = False) -> str:
     """Quote the value of an option that is text, mostly a file name; return other overrides unchanged.
 
-    Quotes around a value, and the interpolation of a path that does not exist, keep their meaning in Hydra. With
-    `is_multirun`, commas separate the values of a sweep unless a file has them in its name.
+    A path that begins with ~ lies in the home folder. Quotes around a value, and the interpolation of a path that does
+    not exist, keep their meaning in Hydra. With `is_multirun`, commas separate the values of a sweep unless a file has
+    them in its name.
     """
     if not (match := _TEXT_OPTION.fullmatch(override)):
         return override
     option, text = match.groups()
-    is_path = option.lstrip("+") != "license"
+    if is_path := option.lstrip("+") != "license":
+        text = os.path.expanduser(text)  # not every shell does so behind an equals sign
     exists = is_path and _exists(text)
     is_quoted = len(text) > 1 and text[0] == text[-1] and text[0] in "'\""
     if text in ("", "null", "???") or (is_quoted and not exists):
@@ -161,7 +163,8 @@ def quote_text(override: str, *, is_multirun: bool = False) -> str:
     if is_multirun and is_path and not exists:
         if _SWEEP.fullmatch(text):
             return override
-        return f"{option}=" + ",".join(_quote(part, is_literal=_exists(part)) for part in text.split(","))
+        parts = map(os.path.expanduser, text.split(","))
+        return f"{option}=" + ",".join(_quote(part, is_literal=_exists(part)) for part in parts)
     return f"{option}={_quote(text, is_literal=exists or not is_path)}"
 
 

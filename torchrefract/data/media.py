@@ -85,7 +85,9 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
         warn_of_unread(source, map(str, candidates))
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
-        raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}")
+        has_folders = not deep and source.is_dir() and any(path.is_dir() for path in source.iterdir())
+        remedy = ", whose folders are not searched; give one of them" if has_folders else ""
+        raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}{remedy}")
     names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")

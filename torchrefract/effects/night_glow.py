@@ -14,7 +14,7 @@ from torchrefract.effects.exposure import is_unsaturated
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.fields.exposure import finite_image, map_rows
 from torchrefract.fields.night_glow import glow_at_nodes, lamp_light, lattice_stride, spread_glow
-from torchrefract.fields.sky import find_sky
+from torchrefract.fields.sky import is_day
 from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
@@ -49,8 +49,9 @@ class NightGlow(PhotometricEffect):
 
     All lamps of a frame have one optical depth T = k d. For lamps at d meters in a visibility of V meters, T is about
     3 d / V. In a composition with fog this effect comes first, as fog darkens the lamps; or last, if the fog has a
-    `lamp_luminance`, so that the fog does not hide the glow. Frames with a sky of the day,
-    see `sky_mask`, have no glow: their drawn luminance is 0. For a clip, its first frame counts.
+    `lamp_luminance`, so that the fog does not hide the glow. Frames by day, with a
+    sky, see `sky_mask`, or a bright road seen from above, have no glow: their drawn luminance is 0. For a clip, its
+    first frame counts.
 
     `intensity` is the mean of v over the channels; `valid` are the pixels that do not saturate.
 
@@ -94,10 +95,10 @@ class NightGlow(PhotometricEffect):
         self.camera = check_camera(camera)
 
     def sample_params(self, stream: random.Stream, image: Tensor) -> NightGlowParams:
-        """Draw all parameters uniformly in their ranges; frames with a sky of the day have lamps without light."""
+        """Draw all parameters uniformly in their ranges; frames by day have lamps without light."""
         applied, values = self.draw_in_ranges(stream, [self._range(name) for name in _LIMITS], image)
-        has_sky = find_sky(image).nodes.flatten(1).any(dim=1)
-        return NightGlowParams(applied, values[:, 0], values[:, 1], torch.where(has_sky, 0.0, values[:, 2]))
+        luminance = torch.where(is_day(image), 0.0, values[:, 2])
+        return NightGlowParams(applied, values[:, 0], values[:, 1], luminance)
 
     def validate(self, params: NightGlowParams, image: Tensor) -> None:
         """Raise ValueError for invalid parameters."""

@@ -221,13 +221,12 @@ class RestorationModule(LightningModule, ABC):
         self.flows = torch.cat(checkpoint["flows"])
 
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
-        for name, score in scores.items():
+        for name, value in scores.items():
             pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
-            value = score[~score.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
-            mean = value.mean() if len(value) else torch.zeros((), device=value.device)  # of weight 0
-            self.log(
-                f"{split}/{name}{suffix}", mean, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(value)
-            )
+            kept = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
+            mean = kept.mean() if len(kept) else torch.zeros((), device=value.device)  # of weight 0
+            options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
+            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(kept), **options)
 
 
 class Restoration(RestorationModule):

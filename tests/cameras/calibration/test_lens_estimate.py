@@ -117,6 +117,13 @@ def test_the_lens_of_a_real_wide_camera_is_found_in_three_pictures(shared_data):
     assert error < 0.5 * nothing
 
 
+def test_frames_of_uint8_have_the_lens_of_floating_ones(drive):
+    frames = [(frame * 255).round() for frame in drive((-0.16, 0.06), 6)[:2]]
+    estimate, expected = (estimate_lens(f) for f in ([f.byte() for f in frames], [f / 255 for f in frames]))
+    assert estimate.num_straight == expected.num_straight
+    assert estimate.camera == expected.camera
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
@@ -125,6 +132,7 @@ def test_the_lens_of_a_real_wide_camera_is_found_in_three_pictures(shared_data):
             [torch.zeros(3, 40, 60), torch.zeros(3, 60, 40)],
             "frames must be of one size.* got 60 x 40 px and, in frame 1, 40 x 60",
         ),
+        ([torch.full((3, 40, 60), 128.0)], r"frames must lie in \[0, 1\] or be uint8, got a mean of 128; divide"),
         ([torch.zeros(1, 40, 60)], r"frames must have shape \(3, H, W\) or \(1, 3, H, W\), got \(1, 40, 60\)"),
     ],
 )

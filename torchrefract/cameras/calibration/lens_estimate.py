@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._tensor import to_uint8
-from torchrefract._validation import check_flow, check_number, check_tensor
+from torchrefract._tensor import to_float, to_uint8
+from torchrefract._validation import check_flow, check_number, check_tensor, is_whole
 from torchrefract.cameras.calibration.fit import prior_deviations
 from torchrefract.cameras.calibration.plumb_line import (
     Chains,
@@ -57,13 +57,13 @@ def estimate_lens(
     fitted by cameras, whose median and scatter replace the distribution of published lenses as a prior.
 
     Args:
-        frames: (3, H, W) or (1, 3, H, W), RGB in [0, 1], all of one size; read one at a time.
+        frames: (3, H, W) or (1, 3, H, W), RGB, floating in [0, 1] or uint8, all of one size; read one at a time.
         fov_deg: horizontal field of view of the camera; None assumes a focal length of 0.9 widths. k1 and k2 are
             relative to it; the mapping that rectifies frames is not.
         predict: maps a frame (1, 3, H, W) to the flow (1, 2, h, w), px of its own size, that undistorts it.
 
     Raises:
-        ValueError: there are no frames, they differ in size, or `fov_deg` is not in [1, 170].
+        ValueError: there are no frames, they differ in size or lie in 0...255, or `fov_deg` is not in [1, 170].
     """
     focal = focal_of_view(fov_deg)
     size, chains, lenses = None, list[Tensor](), list[Tensor]()
@@ -125,6 +125,7 @@ def radial_lens_of_flow(flow: Tensor, *, aspect: float | None = None) -> Tensor:
 def _check_frame(frame: Tensor, index: int, size: tuple[int, int] | None) -> Tensor:
     image = check_tensor("frames", frame)
     image = image[None] if image.ndim == 3 else image
+    image = to_float(image) if is_whole(image) else image
     if image.ndim != 4 or image.shape[:2] != (1, 3):
         raise ValueError(f"frames must have shape (3, H, W) or (1, 3, H, W), got {tuple(frame.shape)}")
     if size not in (None, image.shape[2:]):
@@ -133,6 +134,8 @@ def _check_frame(frame: Tensor, index: int, size: tuple[int, int] | None) -> Ten
             f"frames must be of one size, since they are of one camera, got {size[1]} x {size[0]} px and, in frame "
             f"{index}, {width} x {height} px"
         )
+    if (mean := image.mean().item()) > 1:
+        raise ValueError(f"frames must lie in [0, 1] or be uint8, got a mean of {mean:.3g}; divide 0...255 by 255")
     return image
 
 

@@ -105,7 +105,7 @@ def test_an_invalid_option_is_one_line_of_error_before_frames_are_read(call, fol
     def refuse(*_, **__):
         raise AssertionError("the frames were read")
 
-    monkeypatch.setattr("torchrefract.cli.lens.read_image", refuse)
+    monkeypatch.setattr("torchrefract.cli.estimation.read_image", refuse)
     assert call("estimate_lens", *words).message.startswith(message)
 
 

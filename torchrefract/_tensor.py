@@ -52,8 +52,9 @@ def cached_constant(*, maxsize: int) -> Callable[[_F], _F]:
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
-    """Return a context without autocast, which the device `meta` does not have."""
-    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
+    """Return a context without autocast. It does nothing where autocast is off, and so adds nothing to an export."""
+    is_enabled = device.type != "meta" and torch.is_autocast_enabled(device.type)  # PyTorch raises for "meta"
+    return torch.autocast(device.type, enabled=False) if is_enabled else nullcontext()
 
 
 @contextmanager
@@ -225,8 +226,5 @@ def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
 @assume_constant_result
 def _rounds_factors(device: str) -> bool:
     backends: Any = torch.backends
-    matmul = getattr(backends.mkldnn if device == "cpu" else backends.cuda, "matmul", None)
-    precision = getattr(matmul, "fp32_precision", None)
-    if precision is None:  # before PyTorch 2.9
-        return torch.get_float32_matmul_precision() != "highest"
+    precision = (backends.mkldnn if device == "cpu" else backends.cuda).matmul.fp32_precision
     return (backends.fp32_precision if precision == "none" else precision) not in ("none", "ieee")

@@ -19,7 +19,7 @@ Examples:
 
 from torchrefract.cli.entry import command
 
-main = command("estimate_lens", __doc__, "lens:estimate_lens", has_sweeps=False)
+main = command("estimate_lens", __doc__, "estimation:estimate_lens", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

@@ -163,7 +163,9 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
         if np.shape(covariance) != (size, size):
             raise ValueError(f"covariance must have shape ({size}, {size}), got {np.shape(covariance)}")
         matrices["covariance"] = _matrix(size, np.asarray(covariance, dtype=float).ravel().tolist())
-    if _is_xml(path):
+    if path.suffix.lower() not in OPENCV_SUFFIXES:
+        raise ValueError(f"path must end in .xml, .yml or .yaml, got {path}")
+    if path.suffix.lower() == ".xml":
         lines = ['<?xml version="1.0"?>', "<opencv_storage>"]
         lines += [f"<{name}>{value}</{name}>" for name, value in scalars.items()]
         for name, matrix in matrices.items():
@@ -383,9 +385,3 @@ def _kalibr_camera(document: Document) -> Camera:
 def _matrix(rows: int, values: Iterable[float]) -> dict[str, Any]:
     data = list(values)
     return {"rows": rows, "cols": len(data) // rows, "data": data}
-
-
-def _is_xml(path: Path) -> bool:
-    if path.suffix.lower() not in OPENCV_SUFFIXES:
-        raise ValueError(f"path must end in .xml, .yml or .yaml, got {path}")
-    return path.suffix.lower() == ".xml"

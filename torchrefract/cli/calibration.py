@@ -311,7 +311,7 @@ def rectify(cfg: DictConfig) -> None:
         if part is None or media.is_video(file):
             return media.is_complete(file, target)
         with suppress(UnreadableImageError):
-            return image_header(target).size == part.size(*image_header(file).size, camera.width)
+            return image_header(target).size == part.size(image_header(file).size[1], camera.width)
         return False
 
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:

@@ -129,7 +129,7 @@ def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
     if name == "robustness" and (given := {"--config-dir", "-cd"}.intersection(arguments)):
         raise UsageError(f"scene must be given as a file, as in scene=[DIR/scene/mine.yaml], got {given.pop()}")
     if name == "preview":
-        arguments = picture_as_option(name, arguments)
+        arguments = picture_as_option(arguments)
     if name == "eval":
         # Only this command needs the training stack here.
         from torchrefract.cli.evaluation import add_choices  # noqa: PLC0415
@@ -188,7 +188,7 @@ def require_task(name: str, arguments: list[str]) -> list[str]:
     return arguments
 
 
-def picture_as_option(name: str, arguments: list[str]) -> list[str]:
+def picture_as_option(arguments: list[str]) -> list[str]:
     """Turn the bare argument that names a picture into `image=<argument>`.
 
     Raises:
@@ -201,7 +201,7 @@ def picture_as_option(name: str, arguments: list[str]) -> list[str]:
     ]
     if len(pictures) > 1:
         names = " and ".join(arguments[i] for i in pictures)
-        raise UsageError(f"{name} must have one picture, in quotes if its name has spaces, got {names}")
+        raise UsageError(f"preview must have one picture, in quotes if its name has spaces, got {names}")
     return [f"image={_quote(argument)}" if i in pictures else argument for i, argument in enumerate(arguments)]
 
 

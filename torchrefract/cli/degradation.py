@@ -82,7 +82,6 @@ class _Shot(NamedTuple):
 
 
 class _Result(NamedTuple):
-    file: Path
     name: str
     num_frames: int = 0
     num_dropped: int = 0  # labels that left the frame
@@ -120,11 +119,11 @@ class Degrader(NamedTuple):
         except (ValueError, TypeError) as error:
             reason = str(error).replace(str(file), str(task.file))
             reason = reason if str(task.file) in reason else f"{task.file}: {reason}"
-            return _Result(task.file, task.name, error=reason, is_lost=is_lost(error))
+            return _Result(task.name, error=reason, is_lost=is_lost(error))
 
     def _picture(self, task: _Task, file: Path, path: Path) -> _Result:
         degraded = self._degraded(file, task.name, task.labels)
-        result = _Result(task.file, task.name, num_frames=1)
+        result = _Result(task.name, num_frames=1)
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
             result = result._replace(num_dropped=num_dropped)
@@ -188,7 +187,7 @@ class Degrader(NamedTuple):
                 yield pixels_of(degraded.image[0])
 
         num_frames = media.convert_video(file, path, change=change)
-        return _Result(task.file, task.name, num_frames=num_frames, is_beyond=any(beyond))
+        return _Result(task.name, num_frames=num_frames, is_beyond=any(beyond))
 
     def _effect(self, image: Tensor) -> Effect:
         return _make_effect(self.scene, image.shape[3] if self.has_width else None)
@@ -243,7 +242,7 @@ def _write(path: Path, data: bytes) -> None:
 def _no_warnings() -> Iterator[None]:
     """Silence warnings of effects: the command warns of an assumed depth itself, and maps show folded pixels."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # both are said elsewhere
+        warnings.simplefilter("ignore", UserWarning)
         yield
 
 
@@ -284,7 +283,7 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
             or (isinstance(labels, CocoLabels) and task.labels and task.name not in finished)
         ]
         _warn([task.file for task in missing], tasks, labels, has_camera=cfg.scene.get("camera") is not None)
-        _degrade_missing(missing, job, workers=min(workers, len(missing)), names=names)
+        _degrade_missing(missing, job, workers=min(workers, len(missing)), total=len(names))
         if isinstance(labels, CocoLabels):
             moved = dict(_read_journal(out))
             content = labels.with_moved({name: moved[name] for name in pictures if name in moved})
@@ -297,7 +296,7 @@ def _is_complete(task: _Task, job: Degrader, stored: Mapping[str, int] | None) -
     return media.is_complete(task.file, target) if stored is None else relative_name(target, job.out) in stored
 
 
-def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, names: dict[str, Path]) -> None:
+def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, total: int) -> None:
     start, num_frames, num_dropped = time.perf_counter(), 0, 0
     failed, beyond = list[_Result](), list[str]()
     results = map_in_processes(job, missing, workers=workers, preload=__name__) if missing else ()
@@ -311,10 +310,10 @@ def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, n
             with (job.out / _JOURNAL).open("a", encoding="utf-8") as journal:
                 # The line before may be incomplete, if its run was killed.
                 journal.write("\n" + json.dumps([result.name, result.annotations]))
-    if len(failed) == len(names):
+    if len(failed) == total:
         raise UsageError(f"source must hold a file that can be degraded, got {failed[0].error}")
     rate = num_frames / (time.perf_counter() - start)
-    num_degraded, num_existing = len(missing) - len(failed), len(names) - len(missing)
+    num_degraded, num_existing = len(missing) - len(failed), total - len(missing)
     dropped = f"; {num_dropped} labels left the frame" if any(task.labels for task in missing) else ""
     print(f"{job.out}: {num_degraded} degraded, {num_existing} already existed, {len(failed)} skipped{dropped}")
     print(f"{num_frames} frames, {rate:.3g} frames a second")

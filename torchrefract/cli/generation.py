@@ -68,7 +68,7 @@ from torchrefract.data.pairs.manifest import (
     scan_rows,
 )
 from torchrefract.data.pairs.ray_engine import check_cluster
-from torchrefract.data.pairs.sources import Sources, find_sources, list_path, read_sources
+from torchrefract.data.pairs.sources import LIST, Sources, find_sources, read_sources
 from torchrefract.data.workers import map_in_processes
 
 _T = TypeVar("_T")
@@ -250,7 +250,7 @@ def _list_frames(
     cfg: DictConfig, source: Path, out: Path, settings: dict[str, Any]
 ) -> tuple[Sources, Callable[[], None]]:
     """Read the list of frames, or scan the source; return the frames and a function that writes a new list."""
-    path = list_path(out) if cfg.files is None else as_path(str(cfg.files))
+    path = out / LIST if cfg.files is None else as_path(str(cfg.files))
     options = {name: settings[name] for name in ("every", "drive_by", "val_share", "seed")}
     if path.is_file():
         # `claim` compares the options of a list in the folder of the set.
@@ -303,8 +303,9 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     workers = 0 if options.engine["name"] == "ray" else min(1, options.workers)
     samples = [*map_in_processes(work, tasks, workers=workers, preload="torchrefract.data.pairs.generator")]
     sizes = [storage.disk_bytes(pair) for pair in samples if pair.data]
-    if lost := [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]:
-        check_none_lost(lost if len(lost) == len(samples) else [], name="source")
+    lost = [pair.row.skipped.removeprefix(LOST) for pair in samples if pair.row.skipped.startswith(LOST)]
+    if len(lost) == len(samples):
+        check_none_lost(lost, name="source")
     mean = sum(sizes) // max(1, len(sizes))
     needed, free = mean * len(missing), None if is_remote(storage.out) else shutil.disk_usage(storage.out).free
     estimate = f"{len(missing)} pairs take about {decimal(needed)} on disk, {decimal(mean)} each"

@@ -57,10 +57,6 @@ class Slider(NamedTuple):
     start: float
     info: str
 
-    def is_moved(self, position: float) -> bool:
-        """Return True if the slider is not where it started."""
-        return abs(position - self.start) > self.step / 4
-
     def value(self, position: float) -> float:
         """Return the value of the parameter at a position of the slider."""
         return float(f"{10**position if self.unit.startswith(_LOGARITHM) else position:.6g}")
@@ -112,7 +108,7 @@ def sliders_of(config: dict[str, Any], table: Sliders) -> list[Slider]:
 def with_fixed(config: dict[str, Any], sliders: Sequence[Slider], positions: Sequence[float]) -> dict[str, Any]:
     """Return a config in which the parameters of moved sliders are fixed."""
     at = dict(zip(sliders, positions, strict=True))
-    moved = [slider for slider in sliders if slider.is_moved(at[slider])]
+    moved = [slider for slider in sliders if abs(at[slider] - slider.start) > slider.step / 4]
     if not moved:
         return config
     # The sun has both coordinates, or is placed by the effect.

@@ -25,8 +25,8 @@ from torchrefract._io import as_path, file_digest, make_folder, matching_files, 
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
 from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
-from torchrefract.cli.lens import estimate_camera, flow_predictor
 from torchrefract.cli.options import (
     check_seed,
     find_device,
@@ -167,10 +167,10 @@ def restore(cfg: DictConfig) -> None:
     with locked("out", out):
         if cfg.pool == "lens":
             job = job.with_one_lens(files, out / "camera.yaml")
-        _restore_missing(files, job, out)
+        _restore_missing(files, job)
 
 
-def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
+def _restore_missing(files: Sequence[Path], job: "_Job") -> None:
     todo = [file for file in files if not job.is_done(file)]
     for loss in describe_losses(todo, upright=True):
         print_warning(loss)
@@ -182,7 +182,7 @@ def _restore_missing(files: Sequence[Path], job: "_Job", out: Path) -> None:
         raise UsageError(f"input must hold a file that can be restored, got {next(iter(failed.values()))}")
     rate = num_frames / (time.perf_counter() - start)
     num_restored, num_existing = len(todo) - len(failed), len(files) - len(todo)
-    print(f"{out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
+    print(f"{job.out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
     if deviations := job.restorer.deviations:
         print(f"standard deviation of the flow: {median(deviations):.1f} px, root mean square, median of the frames")
     print(f"{num_frames} frames, {rate:.3g} frames a second on {job.device}")

@@ -58,8 +58,8 @@ class DepthFolder:
             return None
         return sizes_in_store(self.root) if self.root.exists() else {}
 
-    def check(self, frames: Iterable[tuple[str, int | None]], *, exist: bool = True) -> None:
-        """Raise UsageError if two frames, by name and number, share a map or, with `exist`, if one has none."""
+    def check(self, frames: Iterable[tuple[str, int | None]], *, exist: bool = True) -> list[Path]:
+        """Return the paths of maps; raise UsageError if two frames share one or, with `exist`, if one has none."""
         owners: dict[Path, str] = {}
         for name, frame in frames:
             path = self.find(name, frame) if exist else self.path(name, frame)
@@ -69,6 +69,7 @@ class DepthFolder:
                     "the frames names that differ in more than their extension"
                 )
             owners[path] = name
+        return [*owners]
 
     def find(self, name: str, frame: int | None = None) -> Path:
         """Return the path of an existing map; raise UsageError if there is none."""
@@ -103,7 +104,7 @@ def write_map(path: Path, values: Tensor, *, lowest: int = 0) -> None:
     write_file(path, cv2.imencode(".png", levels)[1].tobytes(), alone=True)
 
 
-def map_levels(values: np.ndarray, *, lowest: int = 0) -> np.ndarray:
+def map_levels(values: np.ndarray, *, lowest: int) -> np.ndarray:
     """Return the levels of a PNG, uint16, in steps of 1/256, from the lowest one; 65535 stands for larger values."""
     return np.clip(np.rint(values.astype(float) / STEP), lowest, _LAST).astype(np.uint16)
 

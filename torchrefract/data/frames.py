@@ -101,7 +101,9 @@ class FrameFolder(Dataset[Frame]):
         if not 0 < check_number("val_share", val_share) < 1:
             raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
-        frames, self.skipped = assign_frames(self.root, size=self.size, split=split, **options)
+        frames = split_frames(self.root, _find_files(self.root), split=split, **options)
+        readable, self.skipped = _check_frames(self.root, [frame.path for frame in frames], self.size)
+        frames = [frame for frame in frames if frame.path in readable]
         self.names = [frame.path for frame in frames]
         self.drive_names = [frame.drive for frame in frames]
         self.drives = sorted(set(self.drive_names))
@@ -126,28 +128,13 @@ class FrameFolder(Dataset[Frame]):
         return Frame(fit(image, self.size), torch.tensor(self.keys[index], device="cpu"), depth)
 
 
-def assign_frames(
-    root: Path, *, size: tuple[int, int] | None, split: str | None, drive_by: str, val_share: float, seed: int
-) -> tuple[list[Source], list[tuple[Path, str]]]:
-    """Assign the frames of a root to drives and splits.
-
-    Arguments and errors are those of `FrameFolder`. With size None, frames may have any size. With split None, all
-    frames are returned, and those of a root with a single drive are for training.
-
-    Returns:
-        the readable frames in order, and the unreadable ones with the reasons.
-    """
-    frames = split_frames(root, _find_files(root), split=split, drive_by=drive_by, val_share=val_share, seed=seed)
-    readable, skipped = _check_frames(root, [frame.path for frame in frames], size or (1, 1))
-    return [frame for frame in frames if frame.path in readable], skipped
-
-
 def split_frames(
     root: Path, files: Sequence[str], *, split: str | None, drive_by: str, val_share: float, seed: int
 ) -> list[Source]:
     """Assign the images among the files of a root to drives and splits, by their names alone.
 
-    Arguments and errors are those of `assign_frames`; files are relative to the root, with forward slashes.
+    Arguments and errors are those of `FrameFolder`; files are relative to the root, with forward slashes. With split
+    None, all frames are returned, and those of a root with a single drive are for training.
     """
     paths = _frames_of(root, files)
     if folders := _split_folders(root) if drive_by == "auto" else {}:

@@ -25,7 +25,7 @@ from torchrefract._io import is_remote, local_file, read_bytes, retried, store_o
 from torchrefract._tensor import to_float, to_uint8
 from torchrefract._validation import UsageError, check_size, check_tensor, warn
 from torchrefract.cameras.camera import Camera
-from torchrefract.data.jpeg import lacks_pixel_data
+from torchrefract.data.jpeg import START_OF_SCAN, lacks_pixel_data
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
@@ -37,7 +37,6 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8\xff"
 _JPEG_END = b"\xff\xd9"
-_START_OF_SCAN = 0xDA
 _BARE_MARKERS = (0x01, *range(0xD0, 0xD8))  # TEM and RST0 to RST7 have no length
 _LATE_CHUNKS = 1 << 16  # bytes at the end of a PNG, in which EXIF data behind the pixels lies
 _PNG_DEPTH = 24  # position of the bits of a channel
@@ -379,7 +378,7 @@ def _check_complete(path: str | Path, stream: BinaryIO, length: int) -> None:
     if length == 0:
         raise UnreadableImageError(f"{path} is empty (0 bytes)")
     head = stream.read(16)
-    if head.startswith(b"\xff\xd8\xff"):
+    if head.startswith(_JPEG):
         is_complete = _contains(stream, _JPEG_END, _scan_start(stream, length), length)
     elif head.startswith(_PNG):
         is_complete = _contains(stream, _PNG_END, 8, length)
@@ -408,7 +407,7 @@ def _scan_start(stream: BinaryIO, length: int) -> int:
     while position + 4 <= length:
         stream.seek(position)
         fill, marker, high, low = stream.read(4)
-        if fill != 0xFF or marker == _START_OF_SCAN:
+        if fill != 0xFF or marker == START_OF_SCAN:
             return position
         # A marker may be preceded by any number of fill bytes 0xFF.
         position += 1 if marker == 0xFF else 2 if marker in _BARE_MARKERS else 2 + 256 * high + low

@@ -11,7 +11,7 @@ import numpy as np
 from PIL.JpegImagePlugin import JpegImageFile
 
 _MARKER = re.compile(rb"\xff+[^\x00\xff]", re.DOTALL)  # in pixel data, a byte 0xFF is followed by 0
-_START_OF_SCAN, _END = 0xDA, 0xD9
+START_OF_SCAN, _END = 0xDA, 0xD9
 _RESTARTS = range(0xD0, 0xD8)
 _WITHOUT_LENGTH = (0x01, *range(0xD0, _END))
 _PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)  # start of frame
@@ -61,5 +61,5 @@ def _extend_scans(data: bytes) -> tuple[bytes, bool, bool]:
         if code not in _WITHOUT_LENGTH:
             end = position + int.from_bytes(data[position : position + 2], "big")
             parts.append(data[position:end])
-            position, in_scan, num_restarts = end, code == _START_OF_SCAN, 0
+            position, in_scan, num_restarts = end, code == START_OF_SCAN, 0
     return b"".join([*parts, data[position:]]), is_progressive, is_in_sequence

@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from torchrefract._io import is_remote
-from torchrefract._validation import UsageError, warn
+from torchrefract._validation import UsageError, first_names, warn
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
@@ -61,7 +61,6 @@ VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".m4v", ".webm", ".ts", ".mts"
 
 _ENCODING = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_QUALITY, 95]}
 _TAGGED = (".jpg", ".jpeg", ".png", ".webp")  # formats that hold EXIF data and color profiles
-_MAX_NAMES = 3  # of files in a message
 
 
 def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequence[Path]:
@@ -138,20 +137,20 @@ def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
 
 def describe_losses(files: Sequence[Path], *, upright: bool) -> list[str]:
     """Describe what outputs of files will lack, one line for each kind of loss; unreadable files are ignored."""
-    lossy = defaultdict[str, list[Path]](list)
+    lossy = defaultdict[str, list[str]](list)
     for file in files:
         try:
             losses = list(video_losses(file) if is_video(file) else _picture_losses(file, upright=upright))
         except UnreadableImageError:
             continue
         for loss in dict.fromkeys(losses):
-            lossy[loss].append(file)
-    return [f"{loss}: {_names(affected)}" for loss, affected in lossy.items()]
+            lossy[loss].append(file.name)
+    return [f"{loss}: {first_names(affected)}" for loss, affected in lossy.items()]
 
 
 def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
     """Describe the files whose tags turn the stored pixels for display; empty without such files."""
-    turned = [file for file in files if _is_turned(file)]
+    turned = [file.name for file in files if _is_turned(file)]
     if not turned:
         return ""
     use = (
@@ -161,7 +160,7 @@ def describe_turned(files: Sequence[Path], *, upright: bool = False) -> str:
     )
     return (
         f"{len(turned)} of {len(files)} files have a tag that turns them for display (EXIF orientation, or rotation of "
-        f"a video): {_names(turned)}. {use}"
+        f"a video): {first_names(turned)}. {use}"
     )
 
 
@@ -205,7 +204,3 @@ def _picture_losses(file: Path, *, upright: bool) -> Iterator[str]:
         yield f"{header.bits} bits a channel are written as 8, since {suffix} holds no more"
     if header.orientation != 1 and not upright and suffix not in _TAGGED:
         yield f"the orientation is not kept, since {suffix} cannot hold it"
-
-
-def _names(files: Sequence[Path]) -> str:
-    return ", ".join(file.name for file in files[:_MAX_NAMES]) + (" …" if len(files) > _MAX_NAMES else "")

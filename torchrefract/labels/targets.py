@@ -302,13 +302,9 @@ def _box_axes(points: Tensor, converged: Tensor, corners: Tensor) -> Tensor:
     original = (corners[:, :, 1] - corners[:, :, 0]).to(along.dtype)
     x_axis = torch.tensor([1.0, 0.0], dtype=along.dtype, device=along.device)
     for default in (original, x_axis):
-        along = torch.where(_length(along) > 1e-6, along, default)
-    along = along / _length(along)
+        along = torch.where(along.norm(dim=-1, keepdim=True) > 1e-6, along, default)
+    along = along / along.norm(dim=-1, keepdim=True)
     return torch.stack([along, torch.stack([-along[..., 1], along[..., 0]], dim=-1)], dim=2)
-
-
-def _length(vector: Tensor) -> Tensor:
-    return vector.square().sum(dim=-1, keepdim=True).sqrt()
 
 
 def _siblings(paths: list[Any], i: int) -> dict[str, int]:

@@ -117,13 +117,8 @@ class Diffusion(AveragedRestoration):
         seed: int = 0,
     ):
         target = target_of(task)
-        options: dict[str, Any] = {
-            "lr": lr,
-            "weight_decay": weight_decay,
-            "warmup_steps": warmup_steps,
-            "schedule": schedule,
-        }
-        options |= {"metric_size": metric_size, "ema_decay": ema_decay, "seed": seed}
+        options: dict[str, Any] = {"lr": lr, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
+        options |= {"schedule": schedule, "metric_size": metric_size, "ema_decay": ema_decay, "seed": seed}
         super().__init__(network(target.channels), task, **options)
         self.target = target
         self.prediction = check_choice("prediction", prediction, _PREDICTIONS)

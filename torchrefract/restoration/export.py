@@ -45,7 +45,7 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
     network = FullSizeModel(loaded.model, size=loaded.size, interpolation=interpolation).eval()
     images = torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(0))
     # torch.export warns of weights in another memory format.
-    program = trace(network.to(memory_format=torch.contiguous_format), images)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+    program = trace(network.to(memory_format=torch.contiguous_format), images)
     with torch.no_grad():
         expected = network(images)
     outputs = [*_TOLERANCES][: len(expected)]

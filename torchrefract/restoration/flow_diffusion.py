@@ -8,10 +8,11 @@ import torch
 from diffusers import DDPMScheduler
 from torch import Tensor, nn
 
+from torchrefract._tensor import without_autocast
 from torchrefract._validation import UsageError, check_count
 from torchrefract.random import Stream, uniform
 from torchrefract.restoration.diffusion import NUM_LEVELS, AveragedRestoration, check_steps, normal, sample
-from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, full_precision, polynomial_basis
+from torchrefract.restoration.models.coordconv import NUM_TERMS, cell_axes, polynomial_basis
 from torchrefract.restoration.tasks import Restored, Task, Undistort, frame_sides
 from torchrefract.types import Pair
 from torchrefract.warping.warp import warp
@@ -107,7 +108,7 @@ class FlowDiffusion(AveragedRestoration):
         numbers = self._sample(cast(Any, self.network).encode(degraded), self._stream(key, 0))
         mean = numbers.mean(dim=1)
         rest = numbers - mean[:, None]
-        with full_precision(degraded):
+        with without_autocast(degraded.device):
             basis = polynomial_basis(*cell_axes(degraded, 1))
             coefficients = torch.cat([self.center[None], self.components]).unflatten(1, (2, -1))
             maps = frame_sides(degraded) * torch.einsum("kct,thw->kchw", coefficients, basis)  # px
@@ -137,7 +138,7 @@ class FlowDiffusion(AveragedRestoration):
     def _loss(self, batch: Pair, step: int) -> Tensor:
         source, features = self._stream(batch.key, step), cast(Any, self.network).encode(batch.degraded)
         variance = self.components.square().sum(dim=1)
-        with full_precision(batch.flow):
+        with without_autocast(batch.flow.device):
             numbers = (fit_polynomial(batch) - self.center) @ self.components.mT / variance
         numbers = numbers[:, None].expand(-1, _NUM_NOISY, -1)
         # One level in each of equal parts of the range, so that the loss varies less from step to step.

@@ -67,19 +67,14 @@ class Restorer:
             return [Restored(image[None].clamp(0, 1)) for image in tiled]
         small = torch.cat([resize_image(image[None], self.size) for image in images])
         restored = self.model(small)
-        flows = [None] * len(images) if restored.flow is None else restored.flow.split(1)
-        parts = zip(images, small.split(1), map(Restored, restored.image.split(1), flows), strict=True)
+        rows = zip(*([None] * len(images) if part is None else part.split(1) for part in restored), strict=True)
         results = [
-            at_full_size(one, image[None], small=before, interpolation=self.interpolation)
-            for image, before, one in parts
+            at_full_size(Restored(*row), image[None], small=before, interpolation=self.interpolation)
+            for row, image, before in zip(rows, images, small.split(1), strict=True)
         ]
-        if restored.deviation is None:
-            return results
-        maps = [
-            resize_flow(one, image.shape[1:]) for image, one in zip(images, restored.deviation.split(1), strict=True)
-        ]
+        maps = [result.deviation for result in results if result.deviation is not None]
         self.deviations += [one.square().sum(dim=1).mean().sqrt().item() for one in maps]
-        return [result._replace(deviation=one) for result, one in zip(results, maps, strict=True)]
+        return results
 
     def _restore_tile(self, tiles: Tensor) -> Tensor:
         restored = self.model(tiles)
@@ -103,13 +98,9 @@ class LensRestorer:
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
         self._flow = lru_cache(maxsize=2)(lambda h, w: camera_flow(camera.resized(width=w, height=h))[0])
 
-    def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
-        """Restore pictures (3, H, W) in [0, 1]."""
-        return [restored.image[0] for restored in self.restore(images)]
-
     @torch.inference_mode()
     def restore(self, images: Sequence[Tensor]) -> list[Restored]:
-        """Restore pictures (3, H, W) as batches of one, with the flow."""
+        """Restore pictures (3, H, W) in [0, 1] as batches of one, with the flow."""
         flows = [self._flow(*image.shape[1:]).to(image.device, image.dtype) for image in images]
         options = {"padding": "border", "interpolation": self.interpolation}
         pairs = zip(images, flows, strict=True)
@@ -137,7 +128,9 @@ def at_full_size(restored: Restored, image: Tensor, *, small: Tensor, interpolat
     if restored.flow is None:
         return Restored(transfer_change(image, small, restored.image).clamp(0, 1))
     flow = resize_flow(restored.flow.to(image.dtype), image.shape[2:])
-    return Restored(warp(image, flow, padding="border", interpolation=interpolation)[0].clamp(0, 1), flow)
+    deviation = None if restored.deviation is None else resize_flow(restored.deviation, image.shape[2:])
+    warped, _ = warp(image, flow, padding="border", interpolation=interpolation)
+    return Restored(warped.clamp(0, 1), flow, deviation=deviation)
 
 
 def transfer_change(image: Tensor, small: Tensor, restored: Tensor) -> Tensor:

@@ -225,7 +225,7 @@ class RestorationModule(LightningModule, ABC):
             pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
             kept = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
             mean = kept.mean() if len(kept) else torch.zeros((), device=value.device)  # of weight 0
-            options = {"on_step": False, "on_epoch": True, "sync_dist": True}
+            options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
             self.log(f"{split}/{name}{suffix}", mean, batch_size=len(kept), **options)
 
 

@@ -51,7 +51,7 @@ def pretrained(name: str) -> "Loaded":
         from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - only models need Lightning
     except ImportError as error:
         raise ImportError('pretrained needs Lightning: pip install "torchrefract[train]"') from error
-    return load_model(find_checkpoint(name))
+    return load_model(name)
 
 
 def model_names() -> list[str]:

@@ -67,7 +67,12 @@ class RunSummary(Callback):
             data = trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
             has_lenses = data.effect is not None and _has_part(data.effect, LensDistortion)
             if has_lenses and isinstance(data.train, FrameFolder) and (shifts := bent_drives(data.train)):
-                print(describe_bent(shifts), flush=True)
+                print(
+                    f"warning: the camera of {', '.join(shifts)} has a lens, which shifts the left and right edge by "
+                    f"up to {max(shifts.values()):.1%} of the width. The network will not learn it, and so learns a "
+                    "wrong lens: take it out first, by `python -m torchrefract.estimate_lens` and `rectify`",
+                    flush=True,
+                )
 
     def on_validation_batch_end(
         self,
@@ -142,15 +147,6 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
 
 def _has_part(effect: Effect, kind: type[Effect]) -> bool:
     return any(isinstance(part, kind) for part in effect.modules())
-
-
-def describe_bent(shifts: Mapping[str, float]) -> str:
-    """Return a warning of the drives that `bent_drives` returned."""
-    return (
-        f"warning: the camera of {', '.join(shifts)} has a lens, which shifts the left and right edge by up to "
-        f"{max(shifts.values()):.1%} of the width. The network will not learn it, and so learns a wrong lens: take it "
-        "out first, by `python -m torchrefract.estimate_lens` and `rectify`"
-    )
 
 
 def describe_scene(data: PairData, config: Mapping[str, Any] | None) -> str:

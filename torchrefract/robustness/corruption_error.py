@@ -34,8 +34,8 @@ def compare_with_base(result: Robustness, base: Robustness, *, folder: str, mode
     """Compute the `corruption_error` of each scene and their mean, beside a base of a folder and a model."""
     count = len(images_of_both(result, base))
     left_out, left_out_of_base = (len(run.names) - count for run in (result, base))
-    scenes = {level.scene: corruption_error(result, base, level.scene) for level in result.scores}
-    return BaseComparison(folder, model, count, left_out, left_out_of_base, scenes, corruption_error(result, base))
+    scenes = {scene: corruption_error(result, base, scene) for scene in {level.scene: None for level in result.scores}}
+    return BaseComparison(folder, model, count, left_out, left_out_of_base, scenes, float(np.mean([*scenes.values()])))
 
 
 def corruption_error(result: Robustness, base: Robustness, scene: str | None = None) -> float:

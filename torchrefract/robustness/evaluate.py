@@ -259,7 +259,7 @@ def evaluate(
             options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
             with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
                 while batch := list(itertools.islice(pictures, batch_size)):
-                    predictions = _predict(predict, [of.degraded.image for of in batch])
+                    predictions = _predict(predict, [degraded.image for _, degraded, _ in batch])
                     for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
                         quantity = quantities.get(level.scene)
                         value = quantity.get(degraded.params).item() if quantity else 0.0
@@ -327,26 +327,17 @@ class _PredictionError(Exception):
     """A model that raised, with its reason."""
 
 
-class _Picture(NamedTuple):
-    """A degraded image and its target."""
-
-    level: Level
-    degraded: Degraded
-    target: Any
-
-
 def _degraded(
     image: Tensor, target: Any, scenes: Scenes, seeds: Iterable[int], options: dict[str, Any]
-) -> Generator[_Picture, None, None]:
-    """Yield an image at each level of each scene, once for each seed."""
+) -> Generator[tuple[Level, Degraded, Any], None, None]:
+    """Yield an image and its target at each level of each scene, once for each seed."""
     # No label is true where the degraded image shows nothing of the clean one.
     mask_fill = IGNORED_CLASS if is_tv_tensor(target, "Mask") and target.dtype in _CLASS_TYPES else 0
     for (scene, effects), seed in itertools.product(scenes.items(), seeds):
         with sharing_results():  # the severities of a scene have the same random fields
             for severity, effect in effects.items():
                 degraded = effect.degrade(image, seed=seed, **options)
-                moved = move_target(target, degraded, effect, mask_fill=mask_fill)
-                yield _Picture(Level(scene, severity), degraded, moved)
+                yield Level(scene, severity), degraded, move_target(target, degraded, effect, mask_fill=mask_fill)
 
 
 def _predict(predict: Callable[[Tensor], Any], images: Sequence[Tensor]) -> Any:

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchrefract._tensor import to_uint8
+
 _PROGRAMS = (".pt2", ".onnx", ".pt")
 _HOG_SCALE = 4.0  # a margin that counts as certain
 _LEAST_SCORE = 0.05  # of detections, as in torchvision
@@ -100,7 +102,7 @@ class HogDetector:
 
     def __call__(self, images: Tensor) -> list[dict[str, Tensor]]:
         """Detect pedestrians in images (B, 3, H, W)."""
-        return [self._detect(image.movedim(0, -1).cpu().numpy()) for image in _as_bytes(images)]
+        return [self._detect(image.movedim(0, -1).cpu().numpy()) for image in to_uint8(images)]
 
     def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
         corners, weights = (), ()
@@ -111,11 +113,6 @@ class HogDetector:
         scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
         boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
         return {"boxes": boxes, "labels": torch.ones(len(boxes), dtype=torch.int64), "scores": scores.clamp(0, 1)}
-
-
-def _as_bytes(images: Tensor) -> Tensor:
-    """Return images as uint8, which is what libraries read from files."""
-    return (255 * images).round().clamp(0, 255).byte()
 
 
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
@@ -165,7 +162,7 @@ def _load_transformers(name: str, device: str) -> Predict:
         processor.do_center_crop = False  # the library would stretch the classes of the crop over the frame
 
     def predict(images: Tensor) -> Any:
-        outputs = network(**processor(images=list(_as_bytes(images)), return_tensors="pt").to(device))
+        outputs = network(**processor(images=list(to_uint8(images)), return_tensors="pt").to(device))
         sizes = [tuple(images.shape[2:])] * len(images)
         if task == "ObjectDetection":
             return processor.post_process_object_detection(outputs, threshold=_LEAST_SCORE, target_sizes=sizes)
@@ -187,7 +184,7 @@ def _load_ultralytics(name: str, device: str) -> Predict:
 
     def predict(images: Tensor) -> list[dict[str, Tensor]]:
         # Arrays are padded to the size of the network like files; tensors are taken as they are.
-        arrays = list(_as_bytes(images).flip(1).movedim(1, -1).contiguous().cpu().numpy())  # BGR
+        arrays = list(to_uint8(images).flip(1).movedim(1, -1).contiguous().cpu().numpy())  # BGR
         results = network.predict(arrays, conf=_LEAST_SCORE, device=device, verbose=False)
         boxes = [result.boxes for result in results]
         return [{"boxes": box.xyxy, "labels": box.cls.long(), "scores": box.conf} for box in boxes]

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from torchrefract._io import replace_file, write_file
-from torchrefract._tensor import to_uint8
+from torchrefract.data.images import pixels_of
 from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
 
@@ -119,7 +119,7 @@ def write_report(
         title: one line.
         loss, comparison: as for `write_tables`.
     """
-    names = list(result.set_scores[None])
+    names, rows = list(result.set_scores[None]), result.rows()
     worst = ["worst case"] if result.worst_case else []
     together = f" For {' and '.join(names)}, all images count together." if names else ""
     parts = [
@@ -128,7 +128,7 @@ def write_report(
         "is the mean over scenes and severities, rPC its share of the clean score.</p>",
         _table(["", "clean", "95 % interval", "mPC", "rPC"], _summary_cells(result)),
         *(
-            f'<img alt="{name} by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result, name))}">'
+            f'<img alt="{name} by severity" src="data:image/svg+xml;base64,{_encoded(_curves(result, rows, name))}">'
             for name in ["score", *names[:1]]
         ),
         f"<h2>What the model tolerates</h2><p>Values up to which the mean score falls by at most {loss:.0%}. An open "
@@ -137,7 +137,7 @@ def write_report(
         "<h2>Scores</h2>",
         _table(
             ["scene", "severity", "score", "95 % interval", "drop", *worst, *names, "quantity"],
-            map(_score_cells, result.rows()),
+            map(_score_cells, rows),
         ),
     ]
     if worst:
@@ -207,20 +207,20 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _curves(result: Robustness, of: str) -> bytes:
+def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
     """Draw the score, with intervals, or one of all images together."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
     scenes = list(dict.fromkeys(level.scene for level in result.scores))
     for i, scene in enumerate(scenes):
-        rows = [row for row in result.rows() if row.scene == scene]
+        of_scene = [row for row in rows if row.scene == scene]
         shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
-        x = [row.severity + shift for row in rows]
+        x = [row.severity + shift for row in of_scene]
         if of == "score":
-            y = np.array([row.score for row in rows])
+            y = np.array([row.score for row in of_scene])
             axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
         else:
-            axes.plot(x, [row.set_scores[of] for row in rows], marker="o", label=scene)
+            axes.plot(x, [row.set_scores[of] for row in of_scene], marker="o", label=scene)
     clean = float(result.clean.mean()) if of == "score" else result.set_scores[None][of]
     axes.axhline(clean, color="gray", linestyle="--", label="clean")
     axes.set(xlabel="severity", ylabel=of, ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores}))
@@ -296,7 +296,7 @@ def _figure(example: Example) -> str:
 
 
 def _with_boxes(example: Example) -> Image.Image:
-    picture = _picture(example.image)
+    picture = Image.fromarray(pixels_of(example.image))
     draw = ImageDraw.Draw(picture)
     for name, boxes in (("labels", example.labels), ("predictions", example.predictions)):
         for box in [] if boxes is None else boxes.tolist():
@@ -308,7 +308,7 @@ def _with_classes(prediction: Classes) -> Image.Image:
     """Draw the classes of an image half-transparent over it."""
     palette = np.array([_class_color(i) for i in range(_NUM_COLORS)], np.uint8)
     colors = palette[prediction.classes.long().cpu().numpy() % _NUM_COLORS]
-    return Image.blend(_picture(prediction.image), Image.fromarray(colors), _OPACITY)
+    return Image.blend(Image.fromarray(pixels_of(prediction.image)), Image.fromarray(colors), _OPACITY)
 
 
 def _legend(*predictions: Tensor) -> str:
@@ -329,10 +329,6 @@ def _class_color(index: int) -> tuple[int, int, int]:
     # Neighbors of this map are pairs of a dark and a light color.
     red, green, blue = (round(255 * value) for value in colormaps["tab20"](2 * (index % 10) + index // 10)[:3])
     return red, green, blue
-
-
-def _picture(image: Tensor) -> Image.Image:
-    return Image.fromarray(to_uint8(image[None])[0].movedim(0, -1).cpu().numpy())
 
 
 def _jpeg(picture: Image.Image) -> str:

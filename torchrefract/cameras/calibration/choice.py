@@ -66,7 +66,7 @@ def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) 
     for k, error in enumerate(errors):
         if np.isfinite(error).all():
             difference = error - best
-            excess, paired = (difference.mean() / max(_standard_error(e), 1e-12) for e in (best, difference))
+            excess, paired = (difference.mean() / max(e.std(ddof=1) / len(e) ** 0.5, 1e-12) for e in (best, difference))
             tried[k] = tried[k]._replace(excess=float(excess), paired_excess=float(paired))
     close = [tried[k] for k in accepted if tried[k].excess <= 1 and tried[k].paired_excess <= _NUM_ERRORS]
 
@@ -74,10 +74,6 @@ def choose_model(views: Sequence[View], board: Board, *, size: tuple[int, int]) 
         return one.num_coefficients, one.num_coefficients == 0 and one.prior != "centered", one.held_out
 
     return min(close, key=rank), tried
-
-
-def _standard_error(values: np.ndarray) -> float:
-    return float(values.std(ddof=1)) / len(values) ** 0.5
 
 
 def is_one_to_one(camera: Camera) -> bool:

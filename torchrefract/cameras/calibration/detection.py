@@ -314,16 +314,12 @@ def measure_marker(gray: np.ndarray, view: View, board: Charuco) -> float:
     """
     sides = []
     for inverted in candidates(board.inverted):
-        picture = 255 - gray if inverted else gray
-        markers, _, _ = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary)).detectMarkers(picture)
-        for marker in markers:
+        for marker in _find_markers(255 - gray if inverted else gray, board.dictionary).corners:
             nearest = np.argsort(np.linalg.norm(view.corners - marker[0].mean(axis=0), axis=1))[:_NUM_NEIGHBORS]
             plane = board.corners(view.ids[nearest])[:, :2]
             if len(nearest) < 4 or np.linalg.matrix_rank(plane - plane.mean(axis=0)) < 2:
                 continue
             matrix, _ = cv2.findHomography(view.corners[nearest], plane, 0)
             if matrix is not None:
-                x, y = cv2.perspectiveTransform(marker.astype(float), matrix)[0].T
-                # The area by the shoelace formula is half of the difference.
-                sides.append(abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) ** 0.5 / 2**0.5)
+                sides.append(cv2.contourArea(cv2.perspectiveTransform(marker, matrix)) ** 0.5)
     return float(np.median(sides)) if sides else np.nan

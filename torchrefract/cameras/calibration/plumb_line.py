@@ -323,12 +323,9 @@ def _refine(chains: Chains, prior: Gaussian, start: Tensor) -> Tensor:
 
     lens, value = start, cost(start)
     for _ in range(_MAX_STEPS):
-        with torch.enable_grad():
-            variable = lens.clone().requires_grad_()
-            (gradient,) = torch.autograd.grad(cost(variable), variable, create_graph=True)
-            rows = [torch.autograd.grad(part, variable, retain_graph=True)[0] for part in gradient]
-        curvatures, axes = torch.linalg.eigh(torch.stack(rows))
-        step = -axes @ (axes.T @ gradient.detach() / curvatures.abs().clamp(min=1.0))
+        gradient = torch.autograd.functional.jacobian(cost, lens)
+        curvatures, axes = torch.linalg.eigh(torch.autograd.functional.hessian(cost, lens))
+        step = -axes @ (axes.T @ gradient / curvatures.abs().clamp(min=1.0))
         while step.norm() > _SMALL_STEP and not (covers_frame(lens + step) and cost(lens + step) < value):
             step = step / 2
         if step.norm() <= _SMALL_STEP:

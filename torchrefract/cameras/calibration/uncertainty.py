@@ -57,14 +57,14 @@ class Crop(NamedTuple):
     width: int
     height: int
 
-    def size(self, height: int, width: int, frame_width: int) -> tuple[int, int]:
-        """Return the height and width of this part of a frame (height, width); both are even, which videos need."""
+    def size(self, width: int, frame_width: int) -> tuple[int, int]:
+        """Return the height and width of this part of a frame of a width; both are even, which videos need."""
         columns = 2 * round(self.width * width / frame_width / 2)
         return 2 * round(columns * self.height / self.width / 2), columns
 
     def of(self, image: Tensor, frame_width: int) -> Tensor:
         """Return this part of a frame (C, H, W) in any resolution, around its middle as `Camera.resized` has it."""
-        height, width = self.size(image.shape[1], image.shape[2], frame_width)
+        height, width = self.size(image.shape[2], frame_width)
         top, left = (image.shape[1] - height) // 2, (image.shape[2] - width) // 2
         return image[:, top : top + height, left : left + width]
 

@@ -219,7 +219,7 @@ def _png_size(data: bytes) -> tuple[int, int]:
     return int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
 
 
-def _decode_png(data: bytes, dtype: type, channels: int, size: tuple[int, int] | None = None) -> np.ndarray:
+def _decode_png(data: bytes, dtype: type, channels: int, size: tuple[int, int] | None) -> np.ndarray:
     height, width = _png_size(data)
     if size not in (None, (height, width)):
         raise DamagedPairError(f"it must be of {size} px (height, width), got {(height, width)}")

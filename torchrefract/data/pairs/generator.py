@@ -296,7 +296,7 @@ def generate_pairs(
     storage: PairStorage,
     *,
     workers: int,
-    engine: Mapping[str, Any] | None = None,
+    engine: Mapping[str, Any],
 ) -> Iterator[list[PairRow]]:
     """Generate and write units of pairs in processes, or in this one with `workers` 0.
 
@@ -304,8 +304,8 @@ def generate_pairs(
         units: the pairs of each file that is written as a whole.
         generator, storage: make and write a pair.
         workers: number of processes, or of actors.
-        engine: name "ray", address of a cluster and GPUs of an actor, see `map_in_actors`; None takes processes of
-            this machine.
+        engine: name "ray", address of a cluster and GPUs of an actor, see `map_in_actors`; another name takes processes
+            of this machine.
 
     Yields:
         the rows of each unit when it is written, in any order.
@@ -315,7 +315,7 @@ def generate_pairs(
         Exception: any error of a worker, after the others have finished their units.
     """
     work = partial(storage.write, generator=generator)
-    if engine is not None and engine["name"] == "ray":
+    if engine["name"] == "ray":
         block = 8 if storage.tar is None else 1  # a tar takes long enough by itself
         options: Any = {"address": engine["address"], "num_gpus": engine["num_gpus"], "block": block}
         return map_in_actors(work, units, workers=workers, **options)

@@ -18,7 +18,7 @@ from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_siz
 from torchrefract.data.media import VIDEOS, video_info
 from torchrefract.random import key_of
 
-_LIST = "sources.parquet"
+LIST = "sources.parquet"  # the list in the folder of a set
 _SAMPLES = 16  # images whose headers are read before a set is started
 _BATCH = 10_000  # rows that are Python objects at a time
 
@@ -68,10 +68,8 @@ class Sources(NamedTuple):
         Raises:
             UsageError: a frame has none, or two frames share one.
         """
-        depth.check((frame.path, frame.frame) for frame in self.frames())
         digest = hashlib.sha256()
-        for frame in self.frames():
-            path = depth.find(frame.path, frame.frame)
+        for path in depth.check((frame.path, frame.frame) for frame in self.frames()):
             digest.update(ascii([path.name, depth.size_bytes(path)]).encode())
         return digest.hexdigest()
 
@@ -101,11 +99,6 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         shown = ", ".join(f"{name} is {previous.get(name)} there and {options[name]} here" for name in different)
         raise UsageError(f"files must be a list of the same options, got {path}, where {shown}; choose another folder")
     return Sources(root, table.replace_schema_metadata(), skipped)
-
-
-def list_path(out: Path) -> Path:
-    """Return the path of the list of a set."""
-    return out / _LIST
 
 
 def find_sources(

@@ -3,10 +3,9 @@
 import json
 import re
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import segmentation_models_pytorch as smp
 import timm
@@ -19,6 +18,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from torchrefract._tensor import without_autocast
 from torchrefract._validation import check_rgb, warn
 from torchrefract.warping.grid import pixel_axes
 
@@ -93,7 +93,7 @@ class CoordConvSegmenter(nn.Module):
         for parameter in self.network.segmentation_head.parameters():
             nn.init.zeros_(parameter)
         self.polynomial_head = PolynomialFlowHead(self.network.encoder.out_channels[-1], channels) if smooth else None
-        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+        self.to(memory_format=torch.channels_last)
         self.train()
 
     def train(self, mode: bool = True) -> "CoordConvSegmenter":
@@ -174,7 +174,8 @@ class PolynomialFlowHead(nn.Module):
         """Evaluate the maps (B, channels, H, W), float32, from features (B, F, h, w) at x (W,) and y (H,)."""
         flat = features.float().flatten(2)
         pooled = torch.cat([flat.mean(dim=2), flat.amax(dim=2)], dim=1)
-        with full_precision(features):
+        # bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
+        with without_autocast(features.device):
             coefficients = self.layers(pooled).unflatten(1, (self.channels, NUM_TERMS))
             return torch.einsum("bct,thw->bchw", coefficients, polynomial_basis(x, y))
 
@@ -185,15 +186,6 @@ def polynomial_basis(x: Tensor, y: Tensor) -> Tensor:
     T_i(x) T_j(y) for i + j <= 5,  T_n(x) = cos(n arccos(x))
     """
     return torch.stack([_chebyshev(y, j)[:, None] * _chebyshev(x, i) for i, j in _TERMS])
-
-
-def full_precision(like: Tensor) -> AbstractContextManager[Any]:
-    """Return a context without autocast on the device of a tensor.
-
-    bfloat16 has 8 bits of mantissa: a flow of 100 px would be off by a quarter of a pixel.
-    """
-    device = like.device.type
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def pixel_coordinates(image: Tensor) -> Tensor:
@@ -238,7 +230,7 @@ def _add_coordinate_inputs(encoder: nn.Module, *, start_at_zero: bool) -> None:
     stem = next(module for module in encoder.modules() if isinstance(module, nn.Conv2d))
     inputs = _CoordinateInputs(stem.weight.detach(), start_at_zero=start_at_zero)
     parametrize.register_parametrization(stem, "weight", inputs, unsafe=True)  # unsafe: the shape changes
-    stem.in_channels = cast(Tensor, stem.weight).shape[1]
+    stem.in_channels = stem.weight.shape[1]
 
 
 def _find_weights(encoder: str, pretrained: str) -> tuple[Path, list[float], list[float]]:

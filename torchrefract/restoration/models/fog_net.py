@@ -52,7 +52,7 @@ class FogNet(nn.Module):
         self.head = nn.Conv2d(widths[0], 1 + check_count("channels", channels, low=3), 3, padding=1)
         for parameter in self.head.parameters():
             nn.init.zeros_(parameter)
-        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in torch's annotations
+        self.to(memory_format=torch.channels_last)
 
     def forward(self, image: Tensor) -> Tensor:
         """Predict the maps (B, channels, H, W) for images (B, 3, H, W) in [0, 1].

@@ -7,8 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from torchrefract._tensor import without_autocast
 from torchrefract._validation import check_count, check_rgb
-from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_axes, full_precision, pixel_coordinates
+from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_axes, pixel_coordinates
 
 _CELL = 4  # px
 _SOBEL = torch.outer(torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]), torch.tensor([-1.0, -2.0, 0.0, 2.0, 1.0])) / 128
@@ -75,7 +76,7 @@ class LensEncoder(nn.Module):
             ValueError: the image has another shape.
         """
         check_rgb("image", image)
-        with full_precision(image):
+        with without_autocast(image.device):
             edges, features = find_edges(image.float())
             weights = F.softplus(self.weights(features)).flatten(2) * edges.strength[:, None]
             strongest = edges.strength.topk(min(self.num_edges, edges.strength.shape[1]), sorted=False).indices

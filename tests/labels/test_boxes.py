@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
-from torchvision.tv_tensors import BoundingBoxes
 
 from torchrefract import LensDistortion, ThinPlateSpline, warp_boxes
 
@@ -174,7 +173,6 @@ BOXES = torch.zeros(2, 3, 4)
         (BOXES, {"clip": 1}, TypeError, "clip must be True or False"),
         (BOXES, {"samples": 1}, ValueError, "samples must be at least 2, got 1"),
         (BOXES, {"min_size": 3}, TypeError, "min_size"),
-        (BoundingBoxes(BOXES[0], format="XYWH", canvas_size=(5, 6)), {}, TypeError, "pass them to warp_labels"),
         (BOXES - torch.arange(4), {}, ValueError, "boxes must have x1 <= x2 and y1 <= y2, got -2"),
         (BOXES * torch.nan, {}, ValueError, "boxes must have x1 <= x2 and y1 <= y2, got nan"),
     ],

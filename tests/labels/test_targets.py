@@ -459,6 +459,12 @@ def test_gradients_reach_the_flow_through_keypoints_and_boxes(wave):
         assert gradient.abs().sum() > 0.5
 
 
+@pytest.mark.parametrize("form", PLAIN_FORMATS)
+def test_boxes_of_torchvision_raise_in_warp_boxes(form, wave):
+    with pytest.raises(TypeError, match=r"got BoundingBoxes of torchvision, .* pass them to warp_labels"):
+        warp_boxes(boxes_of([[10.0, 12.0, 24.0, 20.0]], form), wave)
+
+
 def test_unsupported_types_raise_a_type_error():
     class Skeleton(tv.TVTensor):
         """Derive from the base class, not from one of its types."""

@@ -61,7 +61,7 @@ def test_a_score_of_an_image_without_a_valid_pixel_is_nan(pair, left):
     for score in (
         psnr(restored, clean, left),
         ssim(restored, clean, left),
-        endpoint_error(*flows, left, size=SIZE),
+        endpoint_error(flows[0], flows[1], left, size=SIZE),
         coverage(flows[0], flows[0], flows[1], left),
     ):
         assert score.isnan().tolist() == [False, True, False]

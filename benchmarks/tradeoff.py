@@ -61,6 +61,7 @@ TOLERANCES_PX = (0.01, 0.02, 0.05, 0.1, 0.3, 1.0)
 TOLERANCES_LEVELS = (0.1, 0.3, 1.0)
 STEPS, REFERENCE_STEPS = (1, 2, 4, 8), 16
 MIN_ERROR = 1e-5  # smaller errors are plotted here
+_MIN_SPAN = 4.0  # ratio of the ends of a time axis
 _COLORS = ("#1f77b4", "#d1495b", "#2e8b57", "#8a5fbf", "#c77f1a")
 _BORDER_PX = 12
 _LABEL_PLACES = [(x, y) for y in (4, -11, 15, -22, 26, -33) for x in (4, -26)]  # points, from the marker
@@ -309,6 +310,9 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
             ]
         axes.set(xscale="log", yscale="log", title=name, ylim=(MIN_ERROR / 3, 1000))
         axes.margins(x=0.2)
+        low, high = axes.get_xlim()
+        widening = max(1.0, math.sqrt(_MIN_SPAN * low / high))  # equal times must not look different
+        axes.set_xlim(low / widening, high * widening)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())

@@ -8,6 +8,7 @@ Extinction: the rate at which fog attenuates light, 1/m.
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -235,11 +236,10 @@ class Degraded:
         value = self._maps[name]
         if callable(value):
             device = self.image.device.type
-            if device != "meta" and torch.is_autocast_enabled(device):
-                # Maps are computed when they are read, which may be inside of autocast, but positions need float32.
-                with torch.autocast(device, enabled=False):
-                    return self._read(name)
-            value = self._maps[name] = value(self)
+            is_autocast = device != "meta" and torch.is_autocast_enabled(device)
+            # Maps are computed when they are read, which may be inside of autocast, but positions need float32.
+            with torch.autocast(device, enabled=False) if is_autocast else nullcontext():
+                value = self._maps[name] = value(self)
         return value
 
     def __getstate__(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from torchrefract import random
+from torchrefract._tensor import without_autocast
 from torchrefract._validation import (
     check_count,
     check_number,
@@ -368,11 +369,7 @@ class Effect(nn.Module, ABC):
             depth = given.expand(len(batch), 1, *batch.shape[2:])
         elif depth is not None:
             depth = check_depth_fits(depth, image, shape)
-        if image.device.type != "meta" and torch.is_autocast_enabled(image.device.type):
-            # Autocast would compute matrix products in half, and positions need float32.
-            with torch.autocast(image.device.type, enabled=False):
-                result = self.degrade_batch(batch, params, depth)
-        else:
+        with without_autocast(image.device):  # it would compute matrix products in half, and positions need float32
             result = self.degrade_batch(batch, params, depth)
         result.image = from_batch(result.image, image, batch)
         return result if image.ndim == 4 and not shape.is_clip else result.map(shape.restore)

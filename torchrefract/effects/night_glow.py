@@ -49,9 +49,8 @@ class NightGlow(PhotometricEffect):
 
     All lamps of a frame have one optical depth T = k d. For lamps at d meters in a visibility of V meters, T is about
     3 d / V. In a composition with fog this effect comes first, as fog darkens the lamps; or last, if the fog has a
-    `lamp_luminance`, so that the fog does not hide the glow. Frames by day, with a
-    sky, see `sky_mask`, or a bright road seen from above, have no glow: their drawn luminance is 0. For a clip, its
-    first frame counts.
+    `lamp_luminance`, so that the fog does not hide the glow. Frames by day, with a sky, see `sky_mask`, or a bright
+    road seen from above, have no glow: their drawn luminance is 0. For a clip, its first frame counts.
 
     `intensity` is the mean of v over the channels; `valid` are the pixels that do not saturate.
 

@@ -127,8 +127,8 @@ def find_sky(image: Tensor) -> Sky:
 def is_day(image: Tensor) -> Tensor:
     """Return (N,), bool: the frames have a sky, or are bright above and smooth, as roads that are seen from above.
 
-    Frames are as for `sky_mask`. Of the frames that this was made for, these are 93 % of those by day, and the 5 % of
-    those at night that have a sky.
+    Frames are as for `sky_mask`. Frames by day that are dark above count as night, and those at night in which a sky
+    is taken for one of the day as day.
     """
     sky = find_sky(image)
     y = luma(_nodes(image.detach(), sky.stride))

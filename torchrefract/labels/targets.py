@@ -266,6 +266,7 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
     if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
+        warped = _cast(warped, boxes.dtype)
     else:
         corners = convert_boxes(plain, boxes.format.name, "XYXY") - 0.5
         limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
@@ -275,7 +276,7 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
         warped = _cast(convert_boxes(warped + 0.5, "XYXY", boxes.format.name), boxes.dtype)
         size = warped[:, 2:] - warped[:, :2] if boxes.format.name == "XYXY" else warped[:, 2:]
         keep = keep & (size > 0).all(dim=1)  # rounding can close a narrow box
-    return _Warped(wrap_like(_cast(warped, boxes.dtype), boxes), keep)
+    return _Warped(wrap_like(warped, boxes), keep)
 
 
 def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:

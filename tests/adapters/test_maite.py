@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torchvision import tv_tensors
 
 import torchrefract as tr
 from torchrefract.adapters.maite import MaiteAugmentation
@@ -20,6 +21,8 @@ BULGE = tr.LensDistortion(k1_range=(0.4, 0.4), k2_range=(0, 0), focal_range=(0.7
 CHAIN = tr.Compose([tr.ThinPlateSpline(), tr.UniformFog(), LENS, tr.Turbulence(amplitude_range=(2, 2))])
 # Of pixel edges in px; the second one leaves the frame of `BULGE`.
 BOXES = np.array([[30.0, 20, 60, 50], [0, 0, 4, 4], [60, 40, 128, 96], [5, 60, 40, 90]], np.float32)
+SIZES: Any = {"format": "XYWH", "canvas_size": (H, W)}
+XYWH = tv_tensors.BoundingBoxes(torch.tensor([[30.0, 20, 60, 50]]).repeat(4, 1), **SIZES)
 
 
 @dataclass
@@ -156,6 +159,7 @@ def test_images_that_need_gradients_get_them():
         ({"target": {"boxes": BOXES}}, "datum 'a': target must have boxes, labels and scores, or be scores of .* dict"),
         ({"target": SimpleNamespace(boxes=BOXES, labels=np.ones(4), scores=np.ones(3))}, "scores must have a row for"),
         ({"target": SimpleNamespace(boxes=BOXES[:, [2, 1, 0, 3]], labels=BOXES, scores=BOXES)}, "x1 <= x2"),
+        ({"target": SimpleNamespace(boxes=XYWH, labels=BOXES, scores=BOXES)}, "datum 'a': boxes must be x1, .* XYWH"),
         ({"target": SimpleNamespace(boxes=BOXES[:, :3], labels=BOXES, scores=BOXES)}, r"boxes must have shape \(N, 4"),
         ({"metadata": {"name": "a"}}, "metadata must have an id, got .*name"),
         ({"metadata": {"id": "a", "torchrefract.LensDistortion": 1}}, "metadata must not have torchrefract.LensDis"),

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrefract._validation import check_whole
 from torchrefract.effects.base import Effect
 from torchrefract.labels.boxes import warp_boxes
+from torchrefract.labels.targets import is_tv_tensor
 from torchrefract.random import key_of
 
 
@@ -100,6 +101,11 @@ def _move(target: Any, flow: Tensor) -> Any:
     if not all(hasattr(target, name) for name in ("boxes", "labels", "scores")):
         _check_classes(target)
         return target
+    if is_tv_tensor(target.boxes, "BoundingBoxes") and target.boxes.format.name != "XYXY":
+        raise ValueError(
+            f"boxes must be x1, y1, x2, y2, as in MAITE's protocol, got BoundingBoxes in {target.boxes.format.name}; "
+            "convert them by v2.functional.convert_bounding_box_format of torchvision"
+        )
     boxes = _to_tensor(target.boxes)
     boxes = boxes.reshape(0, 4) if boxes.numel() == 0 else boxes
     if boxes.ndim != 2 or boxes.shape[1] != 4:

@@ -117,9 +117,11 @@ def check_tensor(name: str, value: Tensor) -> Tensor:
 
 
 def check_rgb(name: str, image: Tensor) -> Tensor:
-    """Return `image` if it has the shape (B, 3, H, W)."""
-    if image.ndim != 4 or image.shape[1] != 3:
+    """Return `image` if it is a floating tensor (B, 3, H, W)."""
+    if check_tensor(name, image).ndim != 4 or image.shape[1] != 3:
         raise ValueError(f"{name} must have shape (B, 3, H, W), got {tuple(image.shape)}")
+    if not image.is_floating_point():
+        raise TypeError(f"{name} must be floating in [0, 1], got {image.dtype}; use images.float() / 255 for uint8")
     return image
 
 

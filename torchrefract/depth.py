@@ -92,8 +92,7 @@ class TransformersDepth:
         Raises:
             ValueError: not three channels; an output of the network that is not in m, see `check_depth`.
         """
-        check_rgb("image", image)
-        image = to_float(image) if is_whole(image) else image.detach().float()
+        image = check_rgb("image", to_float(image) if is_whole(image) else image.detach().float())
         depth, is_sky = self._predict(image), sky_mask(image)
         check_depth(depth, name="output of the model")
         scaled = torch.where(is_sky, torch.inf, depth)

@@ -107,6 +107,20 @@ def test_a_model_that_predicts_a_flow_has_no_tiles():
         Restorer(restore_by_flow, size=(16, 28), tile=(8, 8))([picture(20, 20)])
 
 
+@pytest.mark.parametrize("tile", [None, (8, 8)])
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (255 * picture(20, 20), r"image must lie in \[0, 1\].* divide 0...255 by 255"),
+        ((255 * picture(20, 20)).byte(), "images must be floating in .* got torch.uint8; use images.float"),
+        (picture(20, 20)[:1], r"images must have shape \(B, 3, H, W\), got \(1, 1, 20, 20\)"),
+    ],
+)
+def test_a_picture_of_other_values_or_channels_is_rejected(image, message, tile):
+    with pytest.raises((ValueError, TypeError), match=message):
+        Restorer(Restored, size=(16, 28), tile=tile)([image])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

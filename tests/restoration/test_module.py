@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from pytorch_lightning import Callback
-from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.callbacks import LearningRateFinder, ModelCheckpoint
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -250,6 +250,26 @@ def test_a_trainer_predicts_for_images_and_for_pairs(trainer, training, loader):
     for batch in (training[0], training[0].degraded):
         (restored,) = trainer().predict(model, loader([batch]))
         assert_close(restored.image, training[0].degraded)
+
+
+@pytest.mark.parametrize(
+    ("factor", "dtype", "message"),
+    [
+        (255, torch.uint8, "batch must be floating in .*, got torch.uint8; use images.float"),
+        (255, torch.float32, "image must lie in .* 0...255 by 255"),
+    ],
+)
+def test_a_trainer_predicts_for_no_images_of_0_to_255(trainer, training, loader, factor, dtype, message):
+    images = (factor * training[0].degraded).to(dtype)
+    with pytest.raises((TypeError, ValueError), match=message):
+        trainer().predict(Restoration(Constant, Undistort()), loader([images]))
+
+
+def test_the_learning_rate_finder_of_lightning_trains_before_a_training(trainer, training, loader):
+    finder = LearningRateFinder(num_training_steps=3, early_stop_threshold=None, update_attr=False)
+    model = Restoration(Constant, Undistort())
+    trainer(max_epochs=2, callbacks=[finder], plugins=[]).fit(model, loader(training))
+    assert len(finder.optimal_lr.results["loss"]) == 3
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrefract._validation import check_choice, check_count, check_size
+from torchrefract._validation import check_choice, check_count, check_rgb, check_size
 from torchrefract.cameras.camera import Camera
+from torchrefract.effects.batch import check_image_values
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.restoration.tasks import Restored
 from torchrefract.warping.flow import resize_flow, resize_image
@@ -62,6 +63,8 @@ class Restorer:
     @torch.inference_mode()
     def restore(self, images: Sequence[Tensor]) -> list[Restored]:
         """Restore pictures (3, H, W) as batches of one, with the flow and its deviation if the model predicts them."""
+        for image in images:
+            check_image_values(check_rgb("images", image[None]))
         if self.tile is not None:
             tiled = [restore_tiles(self._restore_tile, image, tile=self.tile, batch=self.batch) for image in images]
             return [Restored(image[None].clamp(0, 1)) for image in tiled]

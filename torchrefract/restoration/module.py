@@ -12,7 +12,8 @@ from pytorch_lightning.trainer.states import TrainerFn
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
-from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_size
+from torchrefract._validation import UsageError, check_choice, check_count, check_number, check_rgb, check_size
+from torchrefract.effects.batch import check_image_values
 from torchrefract.restoration.checkpoints import rename_weights
 from torchrefract.restoration.metrics import coverage, endpoint_error, psnr, restore_by_transmission, ssim, through_fog
 from torchrefract.restoration.tasks import Restored, Task
@@ -140,6 +141,7 @@ class RestorationModule(LightningModule, ABC):
     def predict_step(self, batch: Tensor | Pair, _: int) -> Restored:
         """Restore a batch of images (B, 3, H, W), or the degraded images of pairs."""
         if isinstance(batch, Tensor):
+            check_image_values(check_rgb("batch", batch))
             return self(batch)
         _check_pair(batch)
         return self(batch.degraded, batch.key)
@@ -184,15 +186,12 @@ class RestorationModule(LightningModule, ABC):
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def setup(self, stage: str) -> None:
-        """Raise UsageError if the trainer would convert frames, flows and scores into another precision."""
+        """Keep the seed of the run; raise UsageError for a precision that would convert frames, flows and scores."""
         if self.trainer.precision not in PRECISIONS and stage != "predict":
             raise UsageError(
                 f"trainer.precision must be one of {', '.join(PRECISIONS)}, since frames, flows and scores need single "
                 f"precision, got {self.trainer.precision}"
             )
-
-    def on_fit_start(self) -> None:
-        """Keep the seed of the run."""
         self.run_seed = torch.initial_seed()
 
     def on_train_batch_start(self, batch: Pair, batch_idx: int) -> None:
@@ -300,7 +299,8 @@ def _check_pair(batch: object) -> None:
     if not isinstance(batch, Pair):
         raise TypeError(
             f"batch must be a Pair of torchrefract, got {type(batch).__name__}; give the trainer "
-            "datamodule=PairData(...), which degrades frames on the device, or a loader of pairs"
+            "datamodule=PairData(...), which degrades frames on the device, a loader of pairs or, to predict, one of "
+            "images (B, 3, H, W)"
         )
 
 

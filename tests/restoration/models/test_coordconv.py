@@ -7,6 +7,9 @@ from numpy.polynomial import Chebyshev
 from torch.testing import assert_close
 
 from torchrefract.restoration.models.coordconv import CoordConvSegmenter, ResUNet, SegFormer, pixel_coordinates
+from torchrefract.restoration.models.denoiser import conditions
+from torchrefract.restoration.models.fog_net import FogNet
+from torchrefract.restoration.models.lens_net import LensNet
 
 SMALL: dict[str, Callable[..., CoordConvSegmenter]] = {
     "resunet": partial(ResUNet, encoder="tu-resnet10t"),
@@ -141,3 +144,10 @@ def test_an_unknown_encoder_is_named(encoder):
 def test_an_image_without_three_colors_is_rejected(shape):
     with pytest.raises(ValueError, match=r"image must have shape \(B, 3, H, W\), got \("):
         build("segformer")(torch.rand(shape))
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("network", [LensNet(2, smooth=True), FogNet(3), conditions], ids=["lens", "fog", "denoiser"])
+def test_bytes_are_rejected_by_every_network(network):
+    with pytest.raises(TypeError, match=r"image must be floating in \[0, 1\], got torch.uint8; use images.float"):
+        network(torch.zeros(1, 3, 32, 32, dtype=torch.uint8))

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from diffusers import UNet2DModel
 from torch import Tensor, nn
 
-from torchrefract._validation import check_count
+from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.restoration.models.lens_net import LENS_FEATURES, LensEncoder
 
@@ -137,7 +137,7 @@ class LensDenoiser(nn.Module):
 
 def conditions(image: Tensor) -> Tensor:
     """Stack an image (B, 3, H, W) in [0, 1], mapped to [-1, 1], and its pixel coordinates to (B, 5, H, W)."""
-    return torch.cat([2 * image - 1, pixel_coordinates(image)], dim=1)
+    return torch.cat([2 * check_rgb("image", image) - 1, pixel_coordinates(image)], dim=1)
 
 
 def _load_published(name: str) -> UNet2DModel:

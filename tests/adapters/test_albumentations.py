@@ -225,6 +225,13 @@ def test_images_whose_depths_give_them_other_flows_raise():
         chain(image=picture(), right=255 - picture())
 
 
+@pytest.mark.parametrize("key", ["image", "images"])
+def test_a_tensor_raises_as_its_channels_are_not_last(key):
+    image = torch.from_numpy(picture()).movedim(-1, 0)
+    with pytest.raises(TypeError, match=f"{key} must be an array .* got Tensor; place effects before ToTensorV2"):
+        adapter.AlbumentationsEffect(STRONG)(**{key: image if key == "image" else [image]})
+
+
 def test_the_seed_of_a_pipeline_and_replay_repeat_the_draws():
     one, two = pipeline(STRONG, seed=5), pipeline(STRONG, seed=5)
     first = [one(image=picture(), **labels()) for _ in range(2)]

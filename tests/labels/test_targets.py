@@ -271,6 +271,13 @@ def test_all_rows_of_dropped_boxes_are_removed():
     assert warped["ids"] is other["ids"]
 
 
+@pytest.mark.parametrize("name", ["semantic_mask", "sem_seg", "depth"])
+def test_a_map_of_the_image_stays_though_its_only_box_leaves_the_frame(name):
+    boxes = tv.BoundingBoxes(torch.tensor([[0.0, 0, 2, 2]]), format="XYXY", canvas_size=SIZE)
+    warped = warp_labels({"boxes": boxes, name: tv.Mask(torch.ones(1, *SIZE))}, SHIFT)
+    assert (len(warped["boxes"]), warped[name].shape) == (0, (1, *SIZE))
+
+
 def test_lists_with_a_dict_mask_or_tensor_for_each_box_lose_those_of_dropped_boxes():
     sample, generated = detection(), generator()
     points = [tv.KeyPoints(torch.rand(17, 2, generator=generated) * 20, canvas_size=SIZE) for _ in range(3)]

@@ -83,6 +83,9 @@ class AlbumentationsEffect(DualTransform):
         image = kwargs[name]
         for _ in range(depth):
             image = image[0]
+        if not isinstance(image, np.ndarray):
+            got = type(image).__name__
+            raise TypeError(f"{name} must be an array (H, W) or (H, W, C), got {got}; place effects before ToTensorV2")
         if depth == 0:
             kwargs[name] = image = np.ascontiguousarray(image)  # so that `apply` receives this very array
         degraded = self._degrade(image, params["seed"])

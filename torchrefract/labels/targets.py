@@ -32,6 +32,7 @@ _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible"
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
 _OF_IMAGE += ("_shape", "canvas", "resolution", "scale_factor", "ratio_pad")
+_MAPS_OF_IMAGE = ("semantic", "sem_seg", "depth")  # of the names of masks (C, H, W) that belong to no box
 
 
 class _Options(NamedTuple):
@@ -77,7 +78,8 @@ def warp_labels(
     tensor, array and list that has as many rows as there are boxes, as labels, areas, keypoints, instance masks,
     (N, H, W), and lists of a dict, mask or tensor for each box. They lie anywhere in the sample or, if it holds several
     `BoundingBoxes`, in the dict, list or tuple of the boxes. Images stay as they are, and so do sizes and values whose
-    name says that they belong to the image or to the camera, as "image_id". `labels_getter` replaces this rule.
+    name says that they belong to the image or to the camera, as "image_id", and masks named as semantic ones or depth.
+    `labels_getter` replaces this rule.
     Dropping reads values, so it waits for an accelerator. Without `drop`, these boxes stay and have zero area.
 
     A rotated box becomes the smallest box around its warped outline that has the direction of the warped top and bottom
@@ -323,7 +325,9 @@ def _rows_of_boxes(
     count, parent = leaves[i].shape[0], paths[i][:-1]
     near = [k for k, path in enumerate(paths) if len(boxes) == 1 or path[: len(parent)] == parent]
     rows = [k for k in near if k not in boxes and _num_rows(leaves[k]) == count]
-    rows = [k for k in rows if not is_tv_tensor(leaves[k], "Mask") or leaves[k].ndim > 2]
+    masks = [k for k in rows if is_tv_tensor(leaves[k], "Mask")]
+    of_image = [k for k in masks if leaves[k].ndim == 2 or any(name in name_of(paths[k]) for name in _MAPS_OF_IMAGE)]
+    rows = [k for k in rows if k not in of_image]
     if callable(labels_getter):
         given = labels_getter(sample)
         labels = [] if given is None else [given, *given] if isinstance(given, list | tuple) else [given]

@@ -64,6 +64,18 @@ def test_labels_follow_a_depth_that_is_computed_from_the_image():
         other(points, params=container._params, data_keys=["keypoints"])
 
 
+@pytest.mark.parametrize("same_on_batch", [False, True])
+def test_a_list_with_a_mask_for_each_image_follows_the_flow_of_that_image(same_on_batch):
+    near_or_far = Turbulence(depth=lambda image: 20 + 800 * image.mean(dim=1, keepdim=True))
+    effect = adapter.KorniaEffect(near_or_far, same_on_batch=same_on_batch)
+    container = K.AugmentationSequential(effect, data_keys=["input", "mask"])
+    image, soft, *_ = inputs()
+    _, listed = container(image, list(soft))
+    _, together = container(image, soft, params=container._params)
+    assert_close(torch.cat(listed), together)
+    assert not torch.equal(together, soft)
+
+
 def test_frames_of_a_clip_share_a_draw_that_their_labels_follow():
     effect = LensDistortion(k1_range=(-0.4, 0.3))
     clips = K.VideoSequential(adapter.KorniaEffect(effect), data_format="BTCHW", same_on_frame=True)

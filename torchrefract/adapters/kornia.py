@@ -46,7 +46,8 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         """Draw the seed and the keys of the samples, which determine the parameters of the effect."""
         keys = torch.zeros(batch_shape[0], dtype=torch.int64) if self.same_on_batch else torch.arange(batch_shape[0])
         # A `VideoSequential` repeats each parameter along its first dimension, once for each frame.
-        return {"seed": torch.as_tensor(random.call_seed()).reshape(1), "keys": keys}
+        rows = torch.arange(batch_shape[0])
+        return {"seed": torch.as_tensor(random.call_seed()).reshape(1), "keys": keys, "rows": rows}
 
     def compute_transformation(self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any]) -> Tensor:
         """Return identities, (B, 3, 3): no matrix describes an effect."""
@@ -115,4 +116,7 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         seed, flow = self._drawn
         if seed is None or not torch.equal(seed, params["seed"]):
             raise ValueError("labels must be passed in one call with their image, whose depth may decide its flow")
-        return None if flow is None else flow.to(like.device)
+        if flow is None:
+            return None
+        rows = params["rows"]  # of a list of masks, each comes with the parameters of its image alone
+        return (flow[rows] if len(rows) < len(flow) else flow).to(like.device)

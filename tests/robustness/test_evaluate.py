@@ -186,7 +186,7 @@ def test_labels_and_clean_predictions_move_along_the_flow():
 
 
 @pytest.mark.quick
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.int64])
 def test_pixels_that_show_nothing_of_the_clean_image_are_not_scored(dtype):
     def predict(images: Tensor) -> Tensor:
         """Take all for class 1, of three."""
@@ -200,6 +200,19 @@ def test_pixels_that_show_nothing_of_the_clean_image_are_not_scored(dtype):
         result = evaluate(predict, samples, {"lens": {3: lens}}, segmentation_score, as_target=as_labels)
         assert [row.score.value for row in result.rows()] == [1]
         assert result.set_scores[Level("lens", 3)] == {"mIoU": 1}
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int8, torch.uint16])
+def test_classes_of_any_type_take_the_place_of_labels_where_the_degraded_image_shows_something(dtype):
+    def predict(images: Tensor) -> Tensor:
+        """Take all for class 1."""
+        return torch.ones(len(images), *images.shape[2:], dtype=dtype)
+
+    samples = [("a.png", torch.ones(3, 60, 90), None)]
+    lens = {3: LensDistortion(k1_range=(-0.3, -0.3), frame="pad")}
+    result = evaluate(predict, samples, {"lens": lens}, segmentation_score, as_target=as_labels)
+    assert [row.score.value for row in result.rows()] == [1]
 
 
 @pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test counts fields

@@ -104,6 +104,16 @@ def test_a_prediction_that_does_not_fit_its_labels_raises(valid, prediction, mes
 
 
 @pytest.mark.parametrize(
+    ("prediction", "target"),
+    [(torch.zeros(3, 4, 5), torch.zeros(2, 4, 5)), (BOXES, {"boxes": torch.zeros(2, 4)})],
+    ids=["classes", "boxes"],
+)
+def test_labels_with_a_channel_for_each_class_and_boxes_without_classes_raise(prediction, target):
+    with pytest.raises(ValueError, match="predictions must have the kind and the size of the labels"):
+        check_prediction(prediction, target)
+
+
+@pytest.mark.parametrize(
     ("score", "prediction", "target"),
     [
         (segmentation_score, torch.rand(1, 4, 5), torch.zeros(4, 5).long()),

@@ -129,6 +129,10 @@ def test_a_set_without_labels_has_no_score_and_other_predictions_have_none(monke
     assert math.isnan(set_scores([ignored])["mIoU"])
     assert set_scores([summarize(torch.tensor([0.1, 0.9]), 1)]) == {}
     assert set_scores([summarize(torch.rand(2, 3), torch.rand(2, 3)), ignored]) == {}
+    mask, channels = torch.ones(2, 3).long(), torch.ones(4, 2, 3).long()
+    # A logit or a probability of one class, and a channel for each of several labels, which a score may take.
+    for other, target in ((torch.rand(1, 2, 3), mask), (torch.rand(2, 3), mask), (torch.rand(4, 2, 3), channels)):
+        assert summarize(other, target) is None
     monkeypatch.setitem(sys.modules, "torchmetrics.detection", None)
     with pytest.warns(UserWarning, match="mAP is left out"):
         assert set_scores([summarize(prediction, prediction)]) == {}

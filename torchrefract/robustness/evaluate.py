@@ -21,7 +21,13 @@ from torchrefract.robustness.statistics import Estimate, mean_estimate, tolerate
 from torchrefract.types import Degraded
 
 _MAX_FAILED, _MIN_COUNT = 0.1, 10  # share of the images whose prediction may raise, and from how many on it counts
-_CLASS_TYPES = (torch.uint8, torch.int16, torch.int32, torch.int64)  # of masks that can hold `IGNORED_CLASS`
+_CLASS_TYPES = (
+    torch.uint8,
+    torch.uint16,
+    torch.int16,
+    torch.int32,
+    torch.int64,
+)  # of masks that can hold `IGNORED_CLASS`
 
 
 class Quantity(NamedTuple):

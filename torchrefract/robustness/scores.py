@@ -72,7 +72,8 @@ def as_labels(prediction: Any, size: tuple[int, int]) -> Any:
             f"predictions must have the size of the image, {size}, got {_described(prediction)}; resize the scores of "
             "classes to it"
         )
-    return tv_tensors.Mask((prediction.argmax(dim=0) if prediction.ndim == 3 else prediction).detach())
+    # In a type that holds the class of pixels that are not scored.
+    return tv_tensors.Mask((prediction.argmax(dim=0) if prediction.ndim == 3 else prediction).detach().long())
 
 
 def check_prediction(prediction: Any, target: Any = None) -> None:
@@ -81,11 +82,12 @@ def check_prediction(prediction: Any, target: Any = None) -> None:
         parts = [prediction.get(name) for name in ("boxes", "labels", "scores")]
         shapes = [part.shape if isinstance(part, Tensor) else None for part in parts]
         is_valid = shapes[1] is not None and len(shapes[1]) == 1 and shapes == [(*shapes[1], 4), shapes[1], shapes[1]]
-        fits = isinstance(target, dict)
+        fits = isinstance(target, dict) and {"boxes", "labels"} <= set(target)
     else:
         is_valid = isinstance(prediction, Tensor) and prediction.ndim in (1, 2, 3)
         size = prediction.shape[-2:] if is_valid and prediction.ndim > 1 else ()
-        fits = not isinstance(target, dict) and getattr(target, "shape", ())[-2:] == size
+        shape = () if isinstance(target, dict) else getattr(target, "shape", ())
+        fits = not isinstance(target, dict) and shape in (size, (1, *size) if size else ())
     if not is_valid:
         raise ValueError(
             "predictions must be dicts of tensors: boxes (n, 4), labels (n,) and scores (n,), or tensors (K, H, W), "

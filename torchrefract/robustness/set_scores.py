@@ -33,10 +33,11 @@ def summarize(prediction: Any, target: Any) -> Summary | None:
         detections = [prediction[name] for name in ("boxes", "labels", "scores")]
         return "boxes", [_encode(*detections), _encode(target["boxes"], target["labels"])]
     if isinstance(prediction, Tensor) and isinstance(target, Tensor) and prediction.ndim in (2, 3):
-        is_mask = not target.is_floating_point()
-        return (
-            ("pixels", [[name, *area] for name, area in class_areas(prediction, target).items()]) if is_mask else None
-        )
+        is_whole = not prediction.is_floating_point() or bool((prediction == prediction.long()).all())
+        has_classes = len(prediction) > 1 if prediction.ndim == 3 else is_whole  # not one logit or probability
+        is_mask = not target.is_floating_point() and target.numel() == prediction.shape[-2:].numel()
+        if has_classes and is_mask:
+            return "pixels", [[name, *area] for name, area in class_areas(prediction, target).items()]
     return None
 
 
@@ -70,6 +71,8 @@ def class_areas(prediction: Tensor, target: Tensor) -> dict[int, tuple[int, int]
     classes = prediction.detach().cpu()
     classes = classes.argmax(dim=0) if classes.ndim == 3 else classes
     expected = torch.as_tensor(target).cpu().as_subclass(Tensor).reshape(classes.shape)
+    # PyTorch compares no uint16.
+    classes, expected = (of if of.is_floating_point() else of.long() for of in (classes, expected))
     counts = (expected >= 0) & (expected != IGNORED_CLASS)
     classes, expected = classes[counts], expected[counts]
     areas = {}

@@ -313,6 +313,14 @@ def test_initial_weights_of_another_model_are_one_line_of_error(call, small, wor
         (("+trainer.precision=bf16-true",), "trainer.precision must be one of 32-true, bf16-mixed, 16-mixed, since"),
         (("trainer.max_epochs=-1", "+trainer.max_time=00:00:00:05"), "schedule must be plateau "),
         (("hydra.run.dir=/dev/null/run",), "/dev/null/run could not be written: "),
+        (("frame_size=[16,32]",), "frame_size must be that of data.size, which decides, got [16, 32] and [32, 64]"),
+        (("epochs=2", "trainer.max_epochs=3"), "epochs must be that of trainer.max_epochs, which decides, got 2 and 3"),
+        (("train_scenes=9",), "train_scenes must be that of data.train_count, which decides, got 9 and 8"),
+        (
+            ("~data.train_count", "train_scenes=9"),  # as for frames in a folder
+            "train_scenes must be that of data.train_count, which decides, got 9 and none; leave train_scenes out",
+        ),
+        (("best.monitor=val/psnr",), "best.mode must be max for val/psnr, of which the best is the highest, got min"),
     ],
 )
 def test_an_invalid_option_is_one_line_of_error(call, small, words, message):

@@ -12,7 +12,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrefract._io import as_path, file_digest, is_remote
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
@@ -28,6 +28,9 @@ _T = TypeVar("_T")
 
 FILE_ERRORS = (UnreadableImageError, DamagedPairError)  # their messages name the file
 _NUM_SEEDS = 2**32  # NumPy's limit
+# Options of tasks, and what they set.
+_OF_TASKS = {"frame_size": "data.size", "train_scenes": "data.train_count", "epochs": "trainer.max_epochs"}
+_BEST = dict.fromkeys(("psnr", "psnr_seen", "ssim"), "max") | dict.fromkeys(("loss", "L", "L_rec", "L_k", "epe"), "min")
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -76,6 +79,22 @@ def check_seed(seed: Any) -> int:
     if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
         raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
     return seed
+
+
+def check_task_options(cfg: DictConfig) -> None:
+    """Raise UsageError if an option of a task has no effect, or if `best.mode` would keep the worst epoch."""
+    given = {override.partition("=")[0] for override in HydraConfig.get().overrides.task}
+    for name, place in _OF_TASKS.items():
+        value = OmegaConf.select(cfg, place)
+        if name in given and cfg.get(name) != value:
+            got = f"{cfg.get(name)} and {'none' if value is None else value}"
+            raise UsageError(f"{name} must be that of {place}, which decides, got {got}; leave {name} out")
+    score, mode = str(cfg.best.monitor).removeprefix("val/"), cfg.best.mode
+    if score in _BEST and mode != _BEST[score]:
+        best = "highest" if mode == "min" else "lowest"
+        raise UsageError(
+            f"best.mode must be {_BEST[score]} for {cfg.best.monitor}, of which the best is the {best}, got {mode}"
+        )
 
 
 def find_device(name: str) -> torch.device:

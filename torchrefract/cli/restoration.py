@@ -29,6 +29,7 @@ from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
     check_seed,
+    check_task_options,
     find_device,
     make,
     naming,
@@ -216,6 +217,7 @@ def export(cfg: DictConfig) -> None:
 def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, dict[str, Any] | None]:
     """Instantiate data, model and trainer, check that they fit together, and read the checkpoint at `ckpt_path`."""
     OmegaConf.resolve(cfg)
+    check_task_options(cfg)
     camera = _place_scene(cfg)
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
@@ -225,11 +227,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         _check_camera(camera, data)
     try:
         trainer = make(cfg, "trainer")
-    except MisconfigurationException as error:
-        raise UsageError(f"trainer: {error}") from error
-    except ModuleNotFoundError as error:
+    except (MisconfigurationException, ModuleNotFoundError) as error:
         name = HydraConfig.get().runtime.choices["logger"]
-        if name == "csv":
+        if isinstance(error, MisconfigurationException) or name == "csv":
             raise UsageError(f"trainer: {error}") from error
         raise UsageError(f"logger={name} needs its package: pip install 'torchrefract[loggers]'") from error
     # Lightning starts the processes of other runs itself.

@@ -50,7 +50,8 @@ class Recorder(LightningModule):
 
     def configure_optimizers(self):
         # As a cosine schedule does; it makes Lightning create the loader before it restores the state of the loops.
-        assert self.trainer.estimated_stepping_batches == EPOCHS * BATCHES or self.trainer.max_epochs != EPOCHS
+        steps = EPOCHS * -(-BATCHES // self.trainer.accumulate_grad_batches)
+        assert self.trainer.estimated_stepping_batches == steps or self.trainer.max_epochs != EPOCHS
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
     def _stop(self, stage: str, index: int) -> None:
@@ -59,7 +60,14 @@ class Recorder(LightningModule):
 
 
 def fit(
-    folder: Path, *, workers: int, epochs: int = EPOCHS, stop_at=None, resume: bool = False, tars: Path | None = None
+    folder: Path,
+    *,
+    workers: int,
+    epochs: int = EPOCHS,
+    stop_at=None,
+    resume: bool = False,
+    tars: Path | None = None,
+    accumulated: int = 1,
 ) -> Recorder:
     model = Recorder(stop_at)
     if tars is None:
@@ -68,6 +76,7 @@ def fit(
         data = pairs(root=tars, buffer=4, batch_size=6, workers=workers)
     trainer = Trainer(
         max_epochs=epochs,
+        accumulate_grad_batches=accumulated,
         accelerator="cpu",
         logger=False,
         enable_progress_bar=False,
@@ -102,6 +111,14 @@ def test_a_resumed_training_gets_the_batches_of_an_uninterrupted_one(tmp_path, e
     rest = fit(tmp_path, workers=workers, resume=True)
     assert not first.batches.keys() & rest.batches.keys()
     assert first.batches | rest.batches == expected
+
+
+@pytest.mark.parametrize("stop_at", [("train", 0, 2), ("train", 1, 0), ("train", 1, 1), ("val", 1, 0)])
+def test_a_training_that_accumulates_gradients_is_stopped_at_the_end_of_a_step(tmp_path, capsys, stop_at):
+    expected = fit(tmp_path / "whole", workers=0, accumulated=2)
+    fit(tmp_path, workers=0, stop_at=stop_at, accumulated=2)
+    assert "stopped by SIGTERM" in capsys.readouterr().err
+    assert torch.equal(fit(tmp_path, workers=0, resume=True, accumulated=2).weight, expected.weight)
 
 
 @pytest.mark.parametrize(("workers", "stop_at"), [(1, ("train", 1, 1)), (0, ("train", 0, 0)), (0, None)])

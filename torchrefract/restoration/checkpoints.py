@@ -67,8 +67,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 class StopOnSigterm(Callback):
     """Stop a training on SIGTERM between two steps, with a checkpoint that continues at the next one.
 
-    A validation is completed first. A training on several devices keeps the checkpoint of its last epoch, because its
-    processes receive the signal in different steps.
+    A validation is completed first, and so is a step that accumulates gradients. A training on several devices keeps
+    the checkpoint of its last epoch, because its processes receive the signal in different steps.
 
     Args:
         run_dir: the run folder, whose last.ckpt the callback replaces.
@@ -79,14 +79,14 @@ class StopOnSigterm(Callback):
         self._is_pending = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Delay the signal until the end of a validation, whose state no checkpoint holds."""
-        forward = signal.getsignal(signal.SIGTERM)
+        """Delay the signal until the end of a validation or of a step, as no checkpoint holds the state within."""
+        self._forward = signal.getsignal(signal.SIGTERM)
 
         def receive(number: int, frame: Any) -> None:
-            if trainer.validating:
+            if trainer.validating or trainer.accumulate_grad_batches > 1:
                 self._is_pending = True
-            elif callable(forward):
-                forward(number, frame)
+            elif callable(self._forward):
+                self._forward(number, frame)
 
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, receive)  # Lightning restores the handler of the caller
@@ -97,10 +97,11 @@ class StopOnSigterm(Callback):
             self._is_pending, trainer._signal_connector.received_sigterm = True, False
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Deliver a delayed signal."""
-        if self._is_pending:
+        """Deliver a delayed signal, on which Lightning stops after this batch."""
+        is_last = (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
+        if self._is_pending and is_last and callable(self._forward):
             self._is_pending = False
-            signal.raise_signal(signal.SIGTERM)
+            self._forward(signal.SIGTERM, None)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Write the checkpoint, and say how to continue."""

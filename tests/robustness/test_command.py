@@ -291,6 +291,10 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
         ("worst_case=7", "worst_case must be True or False, got 7"),
         ("worst_case_draws=1", "worst_case_draws must be at least 2, got 1"),
         ("weights=damaged.pt", "model: weights must be a state_dict of resnet18, got damaged.pt ("),
+        (
+            "model=bright:one weights=other.pt",
+            "model: weights must be null unless the model is torchvision:name, got o",
+        ),
         ("weights=other.pt", "model: weights must be a state_dict of resnet18, got other.pt (Error(s) in loading"),
         ("score=bright:nothing", "score: a function must be package.module:name"),
     ],
@@ -304,7 +308,7 @@ def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, me
     torch.save({}, tmp_path / "other.pt")
     for suffix in (".pt", ".pt2", ".onnx"):
         (tmp_path / f"damaged{suffix}").write_text("nothing")
-    words = (word,) if word.startswith("scene") else (word, "scene=cheap_dashcam")
+    words = (word,) if word.startswith("scene") else (*word.split(), "scene=cheap_dashcam")
     words += ("model=torchvision:resnet18",) if word.startswith("weights") else ()
     assert call(*COMMAND, *words).message.startswith(message)
     assert not list(tmp_path.glob("out/results*"))

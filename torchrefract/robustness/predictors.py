@@ -58,6 +58,11 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
         ValueError: the model has another form, or cannot be found.
     """
     kind, _, name = model.partition(":")
+    if weights is not None and kind != "torchvision":
+        raise ValueError(
+            f"weights must be null unless the model is torchvision:name, got {weights} for {model}; load them in a "
+            "function: model=package.module:name"
+        )
     if kind == "torchvision":
         predict = _load_torchvision(name, weights, device)
     elif kind == "transformers":

@@ -278,6 +278,15 @@ def test_a_map_of_the_image_stays_though_its_only_box_leaves_the_frame(name):
     assert (len(warped["boxes"]), warped[name].shape) == (0, (1, *SIZE))
 
 
+@pytest.mark.parametrize("is_list", [False, True])
+def test_lanes_stay_though_there_are_as_many_as_boxes(is_list):
+    points = torch.full((3, 5, 2), 20.0)
+    lanes = [tv.KeyPoints(of, canvas_size=SIZE) for of in points] if is_list else tv.KeyPoints(points, canvas_size=SIZE)
+    warped = warp_labels(detection() | {"lanes": lanes, "lane_ids": torch.tensor([0, 1, 2])}, SHIFT)
+    assert (len(warped["boxes"]), len(warped["lanes"]), warped["lane_ids"].tolist()) == (2, 3, [0, 2])
+    assert warped["lanes"][1][0].tolist() == [0, 20]
+
+
 def test_lists_with_a_dict_mask_or_tensor_for_each_box_lose_those_of_dropped_boxes():
     sample, generated = detection(), generator()
     points = [tv.KeyPoints(torch.rand(17, 2, generator=generated) * 20, canvas_size=SIZE) for _ in range(3)]

@@ -32,7 +32,7 @@ _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible"
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
 _OF_IMAGE += ("_shape", "canvas", "resolution", "scale_factor", "ratio_pad")
-_MAPS_OF_IMAGE = ("semantic", "sem_seg", "depth")  # of the names of masks (C, H, W) that belong to no box
+_MOVES_WITH_IMAGE = ("semantic", "sem_seg", "depth", "lane", "polyline")  # of masks, points and lists of them
 
 
 class _Options(NamedTuple):
@@ -78,7 +78,7 @@ def warp_labels(
     tensor, array and list that has as many rows as there are boxes, as labels, areas, keypoints, instance masks,
     (N, H, W), and lists of a dict, mask or tensor for each box. They lie anywhere in the sample or, if it holds several
     `BoundingBoxes`, in the dict, list or tuple of the boxes. Images stay as they are, and so do sizes and values whose
-    name says that they belong to the image or to the camera, as "image_id", and masks named as semantic ones or depth.
+    name says that they belong to the image or to the camera, as "image_id", and semantic masks, depth and lanes.
     `labels_getter` replaces this rule.
     Dropping reads values, so it waits for an accelerator. Without `drop`, these boxes stay and have zero area.
 
@@ -325,9 +325,8 @@ def _rows_of_boxes(
     count, parent = leaves[i].shape[0], paths[i][:-1]
     near = [k for k, path in enumerate(paths) if len(boxes) == 1 or path[: len(parent)] == parent]
     rows = [k for k in near if k not in boxes and _num_rows(leaves[k]) == count]
-    masks = [k for k in rows if is_tv_tensor(leaves[k], "Mask")]
-    of_image = [k for k in masks if leaves[k].ndim == 2 or any(name in name_of(paths[k]) for name in _MAPS_OF_IMAGE)]
-    rows = [k for k in rows if k not in of_image]
+    rows = [k for k in rows if not is_tv_tensor(leaves[k], "Mask") or leaves[k].ndim > 2]
+    rows = [k for k in rows if not (_moves(leaves[k]) and any(part in name_of(paths[k]) for part in _MOVES_WITH_IMAGE))]
     if callable(labels_getter):
         given = labels_getter(sample)
         labels = [] if given is None else [given, *given] if isinstance(given, list | tuple) else [given]
@@ -350,6 +349,12 @@ def _rows_of_boxes(
         for k in labels:
             _check_rows(leaves[k], count)
     return [i, *rows]
+
+
+def _moves(leaf: Any) -> bool:
+    """Return True for masks, keypoints, and lists with entries that may hold them."""
+    is_list = type(leaf) in (list, tuple) and not _is_plain_list(leaf)
+    return is_list or is_tv_tensor(leaf, "Mask") or is_tv_tensor(leaf, "KeyPoints")
 
 
 def _num_rows(leaf: Any) -> int | None:

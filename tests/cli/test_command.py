@@ -319,6 +319,8 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
             "model must be one of bridge, ddpm, ddpm_cat256, ddpm_image, fog_net, lens_net, resunet, segformer, got un",
         ),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
+        ("logger=false", "logger must be one of csv, tensorboard, wandb, got false$"),
+        ("data=null", "data must be one of frames, pairs, road_scenes, got null$"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),
         ("data.color=red", "data.color"),
         ("+model.depth=3", "model: .*'depth'"),

@@ -339,6 +339,20 @@ def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(
     assert "error: out must be a folder of the same settings, got one with files={'net.pt': " in outcome.err
 
 
+@pytest.mark.parametrize("changed", ["model", "score"])
+def test_a_run_is_not_continued_after_a_change_of_the_module_of_its_model_or_score(call, tmp_path, frames, changed):
+    names = {"model": f"model_of_{changed}", "score": f"score_of_{changed}"}  # this process has imported the others
+    for name in names.values():
+        (tmp_path / f"{name}.py").write_text(MODEL)
+    words = ("robustness.__main__", f"model={names['model']}:detect", f"score={names['score']}:count", *COMMAND[2:])
+    words += ("scene=cheap_dashcam", "severity=1")
+    for text, code in ((MODEL, 0), (MODEL, 0), (MODEL + "# other weights", 1)):
+        (tmp_path / f"{names[changed]}.py").write_text(text)
+        outcome = call(*words)
+        assert outcome.code == code, outcome.err
+    assert "out must be a folder of the same settings, got one with files={" in outcome.err
+
+
 def test_a_file_that_is_no_picture_is_named_and_skipped(call, tmp_path, frames):
     words = ("scene=cheap_dashcam", "severity=1")
     expected = call(*COMMAND, *words).out

@@ -133,10 +133,10 @@ def test_robustness(cfg: DictConfig) -> None:
     base = None if cfg.base is None else read_base(Path(str(cfg.base)).expanduser(), settings, folder.names)
     with naming("model"):
         predict = load_predictor(str(cfg.model), weights=cfg.weights, device=str(folder.device))
-    # Ultralytics may have downloaded the file just now.
-    settings["files"] = file_digests([*model_files(str(cfg.model)), cfg.weights])
     with naming("score"):
         score = choose_score if cfg.score is None else import_function(*str(cfg.score).partition(":")[::2])
+    # Ultralytics may have downloaded the file just now.
+    settings["files"] = file_digests([*model_files(str(cfg.model)), *model_files(str(cfg.score)), cfg.weights])
     scenes = lru_cache(lambda width: make_scenes(levels, width, folder.place))
     quantities = {name: of for name, by in scenes(REFERENCE_WIDTH).items() if (of := quantity_of(by.values()))}
     if folder.depths is None:

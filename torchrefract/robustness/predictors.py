@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from torchrefract._tensor import to_uint8
 
+_KINDS = ("torchvision", "transformers", "ultralytics")
 _PROGRAMS = (".pt2", ".onnx", ".pt")
 _HOG_SCALE = 4.0  # a margin that counts as certain
 _LEAST_SCORE = 0.05  # of detections, as in torchvision
@@ -91,8 +92,13 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
 
 
 def model_files(model: str) -> list[str]:
-    """Return the paths of the files that a model of `load_predictor` is loaded from, as far as they are local."""
+    """Return the paths of the files that a model of `load_predictor` is loaded from, as far as they are local.
+
+    That of a function is its module, which must have been imported.
+    """
     kind, _, name = model.partition(":")
+    if kind in sys.modules and kind not in _KINDS:
+        return [path] if (path := getattr(sys.modules[kind], "__file__", None)) else []
     path = Path(name).expanduser() if kind in ("transformers", "ultralytics") else Path(model)
     files = [file for file in sorted(path.iterdir()) if file.suffix in _STORED] if path.is_dir() else [path]
     return [str(file) for file in files if file.is_file()]

@@ -97,13 +97,16 @@ def test_a_folder_is_not_continued_with_another_camera_in_the_file_of_the_scene(
     assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
 
 
-def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder):
+@pytest.mark.parametrize("command", COMMANDS)
+def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder, command):
     exif = Image.Exif()
     exif[0x0112] = 3
     Image.new("RGB", (64, 48)).save(folder / "frames" / "c.jpg", exif=exif)
+    source = ("image=frames", "frames=3") if command == "preview" else COMMANDS[command]
+    suffix = ".apng" if command == "preview" else ""
     warning = "c.jpg. They are read as displayed, and so labels and a camera must be of the displayed pictures"
     for name, words in (("with", PLACE[:1]), ("without", ())):
-        outcome = call("degrade", *COMMANDS["degrade"], FOG, *words, f"out={name}")
+        outcome = call(command, *source, FOG, *words, f"out={name}{suffix}")
         assert outcome.code == 0, outcome.err
         assert (warning in outcome.err) == bool(words)
 

@@ -57,6 +57,7 @@ from torchrefract.data.label_files import (
     boxes_of_yolo,
     read_labels,
 )
+from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
@@ -268,7 +269,10 @@ def _folder(cfg: DictConfig) -> _Folder:
     names = names[: read_optional(cfg, "limit", check_count)]
     if (depths := depth_folder(cfg)) is not None:
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths, [], read_place(cfg), find_device(str(cfg.device)))
+    place = read_place(cfg)
+    if (labels or "camera" in place) and (turned := describe_turned([path / name for name in names], upright=True)):
+        print_warning(turned)
+    return _Folder(path, names, labels, depths, [], place, find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:

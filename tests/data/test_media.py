@@ -492,6 +492,16 @@ def test_a_folder_of_folders_is_an_error_that_says_so_where_they_are_not_searche
     assert find_media(tmp_path, deep=True) == [tmp_path / "drive" / "a.png"]
 
 
+def test_folders_beside_files_are_warned_of_where_they_are_not_searched(tmp_path):
+    for name in ("a.png", "drive/b.png", "rectified/a.png", "notes/c.txt", ".hidden/d.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(page()).save(tmp_path / name, "png")
+    (tmp_path / "rectified" / "config.json").touch()  # as commands write it into their output
+    with pytest.warns(UserWarning, match="holds folders with more files, drive, which are not searched; give each by"):
+        assert find_media(tmp_path) == [tmp_path / "a.png"]
+    assert len(find_media(tmp_path, deep=True)) == 3
+
+
 def test_sixteen_bits_are_kept(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 65536, (6, 8, 3)).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), pixels)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchrefract._io import is_remote, local_file, read_bytes, retried, store_of
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract._validation import UsageError, check_size, check_tensor, warn
+from torchrefract._validation import UsageError, check_size, check_tensor, first_names, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.jpeg import START_OF_SCAN, lacks_pixel_data
 
@@ -209,12 +209,26 @@ def local_copy(path: Path) -> Iterator[Path]:
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
     """List the files of a folder with some suffixes, in any case, sorted by name, without folders and hidden files.
 
-    Raises PermissionError if the folder cannot be read, and warns as `warn_of_unread` does.
+    Raises PermissionError if the folder cannot be read. Warns as `warn_of_unread` does, and of folders beside the files
+    that hold such files, too.
     """
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".") and not entry.is_dir()]
+        is_folder = {entry.name: entry.is_dir() for entry in entries if not entry.name.startswith(".")}
+    names = [name for name in is_folder if not is_folder[name]]
     warn_of_unread(folder, names)
-    return sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
+    files = sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
+    inner = sorted(name for name in is_folder if is_folder[name] and _holds_inputs(folder / name, suffixes))
+    if files and inner:
+        warn(
+            f"{folder} holds folders with more files, {first_names(inner)}, which are not searched; give each by itself"
+        )
+    return files
+
+
+def _holds_inputs(folder: Path, suffixes: Sequence[str]) -> bool:
+    """Return True if a folder holds files with some suffixes and is not the output of a command."""
+    names = os.listdir(folder) if os.access(folder, os.R_OK) else []
+    return "config.json" not in names and any(Path(name).suffix.lower() in suffixes for name in names)
 
 
 def natural_order(name: str) -> list[str | int]:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from av.codec.context import Flags
-from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps, PngImagePlugin
 
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import FrameFolder
@@ -459,6 +459,25 @@ def test_exif_data_behind_the_pixels_of_a_png_turn_it(tmp_path):
         assert np.array_equal(np.asarray(ImageOps.exif_transpose(load(target))), displayed)
     source.write_bytes(data[:-12] + late[:-1] + b"?" + data[-12:])
     assert image_header(source).orientation == 1  # its checksum is wrong
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("kind", ["as a long number", "in XMP alone"])
+def test_the_size_in_the_header_is_that_of_the_pixels_whatever_states_the_orientation(tmp_path, suffix, kind):
+    file, exif = tmp_path / f"a{suffix}", Image.Exif()
+    exif[0x010F] = "maker"
+    xmp = (
+        b'<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="6"/>' if "XMP" in kind else b""
+    )
+    data = exif.tobytes() if xmp else b"Exif\0\0MM\0*\0\0\0\b\0\1\1\x12\0\4\0\0\0\1\0\0\0\6\0\0\0\0"
+    info = PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    options = {"pnginfo": info} if suffix == ".png" else {"xmp": xmp}
+    Image.fromarray(page()).save(file, exif=data, **options)
+    height, width = page().shape[:2]
+    expected = (height, width) if xmp else (width, height)  # OpenCV and viewers ignore an orientation of XMP
+    assert image_size(file) == tuple(read_image(file).shape[1:]) == expected
+    assert bool(describe_turned([file])) == (not xmp)
 
 
 @pytest.mark.parametrize("deep", [True, False])

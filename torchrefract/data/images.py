@@ -112,8 +112,12 @@ def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tens
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
     # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
-    _read_header(path, io.BytesIO(data))
-    return to_float(torch.from_numpy(_decode(path, data, upright=upright))).permute(2, 0, 1)
+    orientation, pixels = _read_header(path, io.BytesIO(data)).orientation, _decode(path, data)
+    if upright and orientation != 1:
+        # OpenCV reads some orientations otherwise than Pillow, and then sizes would not be those of the header.
+        pixels = pixels.swapaxes(0, 1) if orientation in _TRANSPOSED else pixels
+        pixels = pixels[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1].copy()
+    return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
 
 
 def exif_of_result(header: ImageHeader, *, upright: bool) -> bytes:
@@ -326,13 +330,13 @@ def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
         with Image.open(stream) as header:
             width, height = header.size
             info = header.info
-            # Without the first test, Pillow decodes a whole PNG to search for EXIF data behind its pixels.
-            tags = header.getexif() if "exif" in info else Image.Exif()
             num_frames, has_alpha = getattr(header, "n_frames", 1), header.has_transparency_data
         stream.seek(0)
         head = stream.read(_PNG_DEPTH + 1)
-        if not (exif := info.get("exif", b"")) and (exif := _late_exif(head, stream)):
-            tags.load(exif)
+        # Pillow's getexif decodes a whole PNG to search for EXIF data, and takes an orientation of XMP, which viewers
+        # and OpenCV ignore.
+        exif, tags = info.get("exif") or _late_exif(head, stream), Image.Exif()
+        tags.load(exif)
         orientation = tags.get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
@@ -356,9 +360,9 @@ def _late_exif(head: bytes, stream: BinaryIO) -> bytes:
     return chunk[4:] if zlib.crc32(chunk) == int.from_bytes(checksum, "big") else b""
 
 
-def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
+def _decode(path: str | Path, data: bytes) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
-    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with _silent_opencv():
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)

@@ -137,6 +137,17 @@ def test_an_interrupted_run_continues(call, folder):
     assert (folder / "out" / "2.png").stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("crop", ["true", "false"])
+def test_a_picture_that_changed_after_it_was_rectified_is_rectified_again(call, folder, crop):
+    write_opencv(folder / "cam.yaml", CAMERAS["opencv"], covariance=np.diag([0.0] * 4 + [0.3**2, 0.0, 0.0, 0.0]))
+    words = ("input=raw", "camera=cam.yaml", "out=out", f"crop={crop}")
+    assert call("rectify", *words).code == 0
+    before = (folder / "out" / "1.png").read_bytes()
+    cv2.imwrite(str(folder / "raw" / "1.png"), 255 - waves())
+    assert call("rectify", *words).out.startswith("out: 1 rectified, 2 already existed, 0 skipped")
+    assert (folder / "out" / "1.png").read_bytes() != before
+
+
 def test_a_folder_of_another_camera_is_rejected(call, folder):
     assert call("rectify", "input=raw", "camera=cam.yaml", "out=out").code == 0
     message = call("rectify", "input=raw", "camera=cam.yaml", "out=out", "zoom=0.5").message

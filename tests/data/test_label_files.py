@@ -111,6 +111,14 @@ def test_yolo_files_keep_their_order_and_drop_what_leaves_the_frame(tmp_path):
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize("others", [("a.txt",), ()])
+def test_labels_whose_suffix_has_capital_letters_are_named(tmp_path, others):
+    for name in ("B.TXT", *others):
+        (tmp_path / name).write_text("0 0.5 0.5 0.2 0.2\n")
+    with pytest.raises(UsageError, match=r"labels must end in .txt or .png, got B.TXT in .*; rename them$"):
+        read_labels(tmp_path, fill=255)
+
+
 @pytest.mark.parametrize(
     "line",
     [

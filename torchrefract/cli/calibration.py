@@ -311,7 +311,9 @@ def rectify(cfg: DictConfig) -> None:
         if part is None or media.is_video(file):
             return media.is_complete(file, target)
         with suppress(UnreadableImageError):
-            return image_header(target).size == part.size(image_header(file).size[1], camera.width)
+            return not media.is_older(target, file) and (
+                image_header(target).size == part.size(image_header(file).size[1], camera.width)
+            )
         return False
 
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:

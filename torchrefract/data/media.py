@@ -46,6 +46,7 @@ __all__ = [
     "describe_turned",
     "find_media",
     "is_complete",
+    "is_older",
     "is_video",
     "output_name",
     "read_video",
@@ -119,12 +120,14 @@ def output_name(file: Path) -> Path:
 
 
 def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
-    """Return True if the output of a file exists and has its number of frames (video) or its sides (picture).
+    """Return True if the output of a file is newer, and has its number of frames (video) or its sides (picture).
 
     The output of a picture may hold several, side by side. A file of a store is not read for it.
     """
     if not target.is_file() or is_remote(file):
         return target.is_file()
+    if is_older(target, file):
+        return False
     if is_video(file):
         # The header of a trimmed video counts frames that are not shown.
         return (num := video_info(target)[0]) > 0 and num in (video_info(file)[0], count_frames(file))
@@ -133,6 +136,11 @@ def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
         return image_size(target) == (height, num_columns * width)
     except UnreadableImageError:
         return False
+
+
+def is_older(target: Path, file: Path) -> bool:
+    """Return True if a file exists and was written to after its output."""
+    return file.is_file() and target.is_file() and target.stat().st_mtime_ns < file.stat().st_mtime_ns
 
 
 def describe_losses(files: Sequence[Path], *, upright: bool) -> list[str]:

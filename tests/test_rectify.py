@@ -120,7 +120,8 @@ def test_a_chain_of_kalibr_is_a_camera_file(call, folder):
     other = replace(CAMERAS["opencv"], fx=60.0)
     write_kalibr(folder / "chain.yaml", {"cam0": CAMERAS["opencv"], "cam1": other})
     message = call("rectify", "input=raw", "camera=chain.yaml").message
-    assert message == "camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None"
+    remedy = "state name in read_camera, or camera_name in rectify, or keep one camera in the file"
+    assert message == f"camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None; {remedy}"
     assert call("rectify", "input=raw", "camera=chain.yaml", "camera_name=cam1").code == 0
     assert read_opencv(folder / "rectified" / "camera.yaml").fx == 60.0
 

@@ -232,6 +232,8 @@ def _read_coco(path: Path) -> CocoLabels:
         annotations = defaultdict[Any, list[Annotation]](list)
         for annotation in document["annotations"]:
             annotations[annotation["image_id"]].append(annotation)
+        if not {*map(type, images)} <= {str} or not isinstance(document.get("categories", []), list):
+            raise TypeError("file_name must be a text and categories a list")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise UsageError(
             f"labels must be a COCO JSON with images (id, file_name, width, height) and annotations (image_id), got "

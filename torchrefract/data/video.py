@@ -159,7 +159,10 @@ def convert_video(
     picture = next(pictures)
     height, width = picture.shape[:2]
     if height % 2 or width % 2:
-        raise UnreadableImageError(f"{source} would give frames of {width} x {height}, and videos take even sides only")
+        raise UnreadableImageError(
+            f"{source} would give frames of {width} x {height}, and videos take even sides only; crop it first: ffmpeg "
+            '-i INPUT -vf "crop=trunc(iw/2)*2:trunc(ih/2)*2" OUTPUT'
+        )
     with contextlib.ExitStack() as stack:
         video = cast(av.VideoStream, _open(source))
         original = stack.enter_context(cast(InputContainer, video.container))

@@ -239,7 +239,7 @@ def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, fo
     assert call("degrade", *WORDS).code == 0
     source, target = folder / "raw" / "one" / "b.png", folder / "out" / "one" / "b.png"
     before = target.read_bytes()
-    cv2.imwrite(str(source), 255 - cv2.imread(str(source)))
+    write(source, 255 - picture())
     assert call("degrade", *WORDS).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
     assert target.read_bytes() != before
 

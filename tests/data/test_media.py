@@ -472,7 +472,7 @@ def test_the_size_in_the_header_is_that_of_the_pixels_whatever_states_the_orient
     data = exif.tobytes() if xmp else b"Exif\0\0MM\0*\0\0\0\b\0\1\1\x12\0\4\0\0\0\1\0\0\0\6\0\0\0\0"
     info = PngImagePlugin.PngInfo()
     info.add_itxt("XML:com.adobe.xmp", xmp.decode())
-    options = {"pnginfo": info} if suffix == ".png" else {"xmp": xmp}
+    options: dict[str, Any] = {"pnginfo": info} if suffix == ".png" else {"xmp": xmp}
     Image.fromarray(page()).save(file, exif=data, **options)
     height, width = page().shape[:2]
     expected = (height, width) if xmp else (width, height)  # OpenCV and viewers ignore an orientation of XMP

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -394,6 +395,20 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[0].unlink()
     message = call("generate", *options, "out=other").message
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
+
+
+def test_a_picture_that_changed_after_its_map_was_written_gets_another_one_but_not_beside_maps_of_others(
+    call, network, tmp_path
+):
+    write_frames(tmp_path)
+    words = ("source=frames", "out=depth", f"network={network('metric')}", "scale_by=model")
+    assert call("estimate_depth", *words).code == 0
+    os.utime(tmp_path / "frames" / "a.png")
+    assert "1 depth maps written" in call("estimate_depth", *words).out
+    assert "0 depth maps written" in call("estimate_depth", *words).out
+    (tmp_path / "depth" / "config.json").unlink()  # as of maps of another program
+    os.utime(tmp_path / "frames" / "a.png")
+    assert "0 depth maps written" in call("estimate_depth", *words).out
 
 
 def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, memory, tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ display matrix) turns them for display. Readers take `upright`: True for the dis
 sensor. Writers keep the tag of a frame of the sensor, so that viewers show every output upright.
 """
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -140,7 +141,10 @@ def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
 
 def is_older(target: Path, file: Path) -> bool:
     """Return True if a file exists and was written to after its output."""
-    return file.is_file() and target.is_file() and target.stat().st_mtime_ns < file.stat().st_mtime_ns
+    if not (file.is_file() and target.is_file()):
+        return False
+    # Cameras in another time zone date files into the future, which says nothing.
+    return target.stat().st_mtime_ns < file.stat().st_mtime_ns <= time.time_ns()
 
 
 def describe_losses(files: Sequence[Path], *, upright: bool) -> list[str]:

@@ -491,6 +491,10 @@ def test_pictures_in_formats_that_are_not_read_are_warned_of(tmp_path, deep):
         assert find_media(tmp_path, deep=deep) == [tmp_path / "a.png"]
     with pytest.warns(UserWarning, match="holds 2 pictures"):
         assert len(FrameFolder(tmp_path, size=(8, 12))) == 1
+    for name in ("d.jfif", "e.ppm", "f.PGM", "g.exr", "h.mpeg", "i.asf", "j.h264"):
+        (tmp_path / name).touch()
+    with pytest.warns(UserWarning, match="holds 9 pictures"):
+        find_media(tmp_path, deep=deep)
 
 
 @pytest.mark.parametrize("deep", [True, False])

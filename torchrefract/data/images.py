@@ -31,7 +31,8 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
 # Pictures and videos that no reader here takes, in folders that hold others.
 _UNREAD = (".heic", ".heif", ".tif", ".tiff", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw")
-_UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360")
+_UNREAD += (".jfif", ".jpe", ".ppm", ".pgm", ".pnm", ".tga", ".exr", ".hdr")
+_UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360", ".mpeg", ".asf", ".ogv", ".3g2", ".mxf", ".h264", ".hevc", ".dav")
 _TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"

@@ -48,6 +48,7 @@ from torchrefract.data import media
 from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
+    describe_folders,
     files_in,
     image_header,
     is_lost,
@@ -126,7 +127,8 @@ def find_pictures(folder: str | Path) -> list[Path]:
     if not (folder := Path(folder)).is_dir():
         raise UsageError(f"images must be an existing folder of pictures, got {folder}")
     if not (files := files_in(folder)):
-        raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}")
+        remedy = describe_folders(folder)
+        raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}{remedy}")
     return files
 
 

@@ -230,6 +230,12 @@ def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
     return files
 
 
+def describe_folders(folder: Path) -> str:
+    """Return the end of a message on a folder without files of some suffixes: its folders, if any, are not searched."""
+    has_folders = any(path.is_dir() for path in folder.iterdir())
+    return ", whose folders are not searched; give one of them" if has_folders else ""
+
+
 def _holds_inputs(folder: Path, suffixes: Sequence[str]) -> bool:
     """Return True if a folder holds files with some suffixes and is not the output of a command."""
     names = os.listdir(folder) if os.access(folder, os.R_OK) else []

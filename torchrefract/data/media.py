@@ -20,6 +20,7 @@ from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
+    describe_folders,
     exif_of_result,
     files_in,
     image_header,
@@ -87,8 +88,7 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
         warn_of_unread(source, map(str, candidates))
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
-        has_folders = not deep and source.is_dir() and any(path.is_dir() for path in source.iterdir())
-        remedy = ", whose folders are not searched; give one of them" if has_folders else ""
+        remedy = describe_folders(source) if not deep and source.is_dir() else ""
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}{remedy}")
     names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:

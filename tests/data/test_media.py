@@ -327,6 +327,19 @@ def test_what_a_video_loses_is_described(tmp_path):
         assert convert_video(file, tmp_path / "b.mp4", change=unchanged) == 1
 
 
+def test_a_sound_and_a_video_of_an_unknown_codec_are_named(tmp_path):
+    write(tmp_path / "a.mov", [page()], sound="aac")
+    data = (tmp_path / "a.mov").read_bytes()
+    (tmp_path / "phone.mov").write_bytes(data.replace(b"mp4a", b"apac").replace(b"esds", b"????"))
+    (tmp_path / "video.mov").write_bytes(data.replace(b"avc1", b"????"))
+    loss = "a sound of a codec that FFmpeg does not know is not kept: phone.mov"
+    assert describe_losses([tmp_path / "phone.mov", tmp_path / "video.mov"], upright=True) == [loss]
+    assert convert_video(tmp_path / "phone.mov", tmp_path / "b.mp4", change=unchanged) == 1
+    assert video_info(tmp_path / "video.mov") == (0, 0.0)
+    with pytest.raises(UnreadableImageError, match=r"video\.mov is not a video with a frame that can be decoded"):
+        convert_video(tmp_path / "video.mov", tmp_path / "c.mp4", change=unchanged)
+
+
 def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
     write(tmp_path / "a.avi", [page(k) for k in range(6)], codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
     data = bytearray((tmp_path / "a.avi").read_bytes())

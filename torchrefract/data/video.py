@@ -92,6 +92,8 @@ def video_losses(path: Path) -> Iterator[str]:
         for stream in video.container.streams:
             if stream.type != "audio" and stream is not video:
                 yield f"a stream of type {stream.type} is not kept"
+            elif not _has_codec(stream):
+                yield "a sound of a codec that FFmpeg does not know is not kept"
             elif stream.type == "audio" and stream.codec_context.name not in _sound_codecs():
                 yield f"the sound is not kept, since MP4 cannot hold {stream.codec_context.name}"
         components = video.format.components if video.format else ()
@@ -174,7 +176,7 @@ def convert_video(
         copies: dict[Stream, Stream] = {
             sound: container.add_stream_from_template(sound)
             for sound in original.streams.audio
-            if sound.codec_context.name in _sound_codecs()
+            if _has_codec(sound) and sound.codec_context.name in _sound_codecs()
         }
         encoded = _encode(stream, chain([picture], pictures), (times.popleft() for _ in count()))
         sounds = _copy_packets(copies)
@@ -191,10 +193,15 @@ def _open(path: Path) -> av.VideoStream | None:
         container = av.open(cast(Any, source), metadata_errors="replace")
     except av.FFmpegError:
         return None
-    if isinstance(video := container.streams.best("video"), av.VideoStream):
+    if isinstance(video := container.streams.best("video"), av.VideoStream) and _has_codec(video):
         return video
     container.close()
     return None
+
+
+def _has_codec(stream: Stream) -> bool:
+    """Return True if FFmpeg knows the codec of a stream: not that of the spatial sound of phones, for example."""
+    return stream.codec_context is not None
 
 
 def _decode(path: Path) -> Iterator[av.VideoFrame]:

@@ -208,6 +208,25 @@ def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, 
         assert np.abs(as_pixels(frame) - as_pixels(original)).mean() < 3
 
 
+def test_whole_seconds_before_the_first_frame_and_sound_are_left_out(tmp_path):
+    first, source, target = tmp_path / "a.ts", tmp_path / "b.ts", tmp_path / "c.mp4"
+    write(first, [page(k) for k in range(8)], times=[40 * k for k in range(8)], sound="aac")
+    with media_file(first) as original, media_file(source, "w") as shifted:
+        copies = {stream: shifted.add_stream_from_template(stream) for stream in original.streams}
+        for packet in original.demux():
+            if packet.dts is not None:
+                packet.pts += int(9000 / packet.time_base)  # the camera was switched on 2.5 h before
+                packet.dts += int(9000 / packet.time_base)
+                packet.stream = copies[packet.stream]
+                shifted.mux(packet)
+    assert times_of(source)[0] >= 9000
+    assert convert_video(source, target, change=unchanged) == 8
+    assert times_of(target) == pytest.approx([t % 1 for t in times_of(source)], abs=1e-3)
+    (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
+    assert times_of(target)[0] - new_start == pytest.approx(times_of(source)[0] - start, abs=1e-3)
+    assert new_samples.shape == samples.shape
+
+
 @pytest.mark.parametrize(("space", "pix_fmt"), [(1, "yuv420p"), (5, "yuv420p"), (9, "yuv420p"), (2, "yuvj420p")])
 def test_colors_are_read_by_the_matrix_and_range_of_the_video_and_kept(tmp_path, space, pix_fmt):
     flat = np.full((32, 48, 3), (200, 60, 30), np.uint8)

@@ -131,6 +131,9 @@ def convert_video(
 ) -> int:
     """Write the changed frames of a video with their times and its sound; return their number.
 
+    Whole seconds before the first frame and sound are left out: recordings such as MPEG-TS may count from when the
+    camera was switched on, and a player of MP4 would wait for so long.
+
     Args:
         source: the video.
         path: of the new video, ending in .mp4.
@@ -178,8 +181,11 @@ def convert_video(
             for sound in original.streams.audio
             if _has_codec(sound) and sound.codec_context.name in _sound_codecs()
         }
-        encoded = _encode(stream, chain([picture], pictures), (times.popleft() for _ in count()))
-        sounds = _copy_packets(copies)
+        start = max(0, original.start_time or 0) // av.time_base  # s
+        shift = round(start / time_base)
+        shifted = ((pts - shift, duration) for pts, duration in (times.popleft() for _ in count()))
+        encoded = _encode(stream, chain([picture], pictures), shifted)
+        sounds = _copy_packets(copies, start)
         return _mux(container, stream, merge(encoded, sounds, key=lambda packet: (packet.dts or 0) * packet.time_base))
 
 
@@ -247,10 +253,13 @@ def _packets(*streams: Stream) -> Iterator[Packet]:
         warn(f"{container.name} is damaged and ends early ({error.strerror})")
 
 
-def _copy_packets(copies: dict[Stream, Stream]) -> Iterator[Packet]:
-    """Yield the packets of streams, each assigned to the copy of its stream."""
+def _copy_packets(copies: dict[Stream, Stream], start: int) -> Iterator[Packet]:
+    """Yield the packets of streams, each assigned to the copy of its stream, with times from `start`, s, on."""
     for packet in _packets(*copies) if copies else ():
         if packet.dts is not None:  # the last, empty packet of each stream has no time
+            shift = round(start / packet.time_base)
+            packet.dts -= shift
+            packet.pts = None if packet.pts is None else packet.pts - shift
             packet.stream = copies[packet.stream]
             yield packet
 

@@ -370,6 +370,10 @@ def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
     # FFmpeg joins the damaged frame with the one after it.
     assert num_frames == 4
     assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.12, 0.16, 0.2], abs=1e-3)
+    with pytest.warns(UserWarning, match="1 damaged frames"):
+        assert is_complete(tmp_path / "a.avi", tmp_path / "b.mp4")  # so that the next run does not convert it again
+    write(tmp_path / "c.avi", [page()] * 7, codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
+    assert not is_complete(tmp_path / "c.avi", tmp_path / "b.mp4")
 
 
 def test_frames_that_change_their_size_raise(tmp_path):

@@ -32,6 +32,7 @@ from torchrefract.data.video import (
     can_write_videos,
     convert_video,
     count_frames,
+    decodable_frames,
     is_turned_video,
     read_video,
     video_info,
@@ -130,8 +131,9 @@ def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
     if is_older(target, file):
         return False
     if is_video(file):
-        # The header of a trimmed video counts frames that are not shown.
-        return (num := video_info(target)[0]) > 0 and num in (video_info(file)[0], count_frames(file))
+        num = video_info(target)[0]
+        # The header of a trimmed video counts frames that are not shown, and only decoding tells damaged ones.
+        return num > 0 and (num in (video_info(file)[0], count_frames(file)) or num == decodable_frames(file))
     try:
         height, width = image_size(file)
         return image_size(target) == (height, num_columns * width)

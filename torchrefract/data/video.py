@@ -78,6 +78,11 @@ def count_frames(path: Path) -> int:
         return sum(packet.size > 0 and not packet.is_discard for packet in _packets(video))
 
 
+def decodable_frames(path: Path) -> int:
+    """Decode a video and count its frames; warns of damaged ones, which are left out."""
+    return sum(1 for _ in _decode(path))
+
+
 def is_turned_video(path: Path) -> bool:
     """Return True if the display matrix of a video turns its frames; False if the file is not a video."""
     first = next(_decode(path), None)

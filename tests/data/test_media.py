@@ -552,13 +552,14 @@ def test_a_folder_of_folders_is_an_error_that_says_so_where_they_are_not_searche
 
 
 def test_folders_beside_files_are_warned_of_where_they_are_not_searched(tmp_path):
-    for name in ("a.png", "drive/b.png", "rectified/a.png", "notes/c.txt", ".hidden/d.png"):
+    for name in ("a.png", "drive/b.png", "rectified/a.png", "calibration/a.png", "notes/c.txt", ".hidden/d.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.fromarray(page()).save(tmp_path / name, "png")
     (tmp_path / "rectified" / "config.json").touch()  # as commands write it into their output
+    (tmp_path / "calibration" / "report.md").touch()
     with pytest.warns(UserWarning, match="holds folders with more files, drive, which are not searched; give each by"):
         assert find_media(tmp_path) == [tmp_path / "a.png"]
-    assert len(find_media(tmp_path, deep=True)) == 3
+    assert len(find_media(tmp_path, deep=True)) == 4
 
 
 def test_sixteen_bits_are_kept(tmp_path):

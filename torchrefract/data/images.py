@@ -33,6 +33,7 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 _UNREAD = (".heic", ".heif", ".tif", ".tiff", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw")
 _UNREAD += (".jfif", ".jpe", ".ppm", ".pgm", ".pnm", ".tga", ".exr", ".hdr")
 _UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360", ".mpeg", ".asf", ".ogv", ".3g2", ".mxf", ".h264", ".hevc", ".dav")
+_OUTPUTS = ("config.json", "report.md")  # in the folders that commands write pictures to
 _TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
@@ -239,7 +240,7 @@ def describe_folders(folder: Path) -> str:
 def _holds_inputs(folder: Path, suffixes: Sequence[str]) -> bool:
     """Return True if a folder holds files with some suffixes and is not the output of a command."""
     names = os.listdir(folder) if os.access(folder, os.R_OK) else []
-    return "config.json" not in names and any(Path(name).suffix.lower() in suffixes for name in names)
+    return not {*_OUTPUTS}.intersection(names) and any(Path(name).suffix.lower() in suffixes for name in names)
 
 
 def natural_order(name: str) -> list[str | int]:

@@ -242,7 +242,8 @@ def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, fo
     write(source, 255 - picture())
     assert call("degrade", *WORDS).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
     assert target.read_bytes() != before
-    os.utime(source, (time.time() + 3600,) * 2)  # by the clock of a camera in another time zone
+    later = time.time() + 3600
+    os.utime(source, (later, later))  # by the clock of a camera in another time zone
     assert call("degrade", *WORDS).out.startswith("out: 0 degraded, 3 already existed, 0 skipped")
 
 

@@ -42,7 +42,7 @@ class Compose(Effect):
     place: the image is sampled before them, and their maps move with the warps after them. Effects that share a
     function from images to depth get the depth of the frame before fog and light, computed once for the first of them;
     samplings move it along, as a depth that is passed. `restore_flow` is the composition of the inverse flows, not
-    valid where it misses by more than 0.5 px, as between the sheets of a fold.
+    valid where it misses by more than 0.1 px, as between the sheets of a fold.
 
     Args:
         effects: at least one; compositions may be nested.

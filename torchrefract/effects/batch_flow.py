@@ -262,8 +262,12 @@ def zero_flow(params: Any, plan: WarpPlan) -> FlowPart:
 
 
 def can_read(params: Any) -> bool:
-    """Return True if the values of parameters can be read without waiting for a device."""
-    return eager_values(params.applied.any, of=params.applied) is not None
+    """Return True if the values of flows with these parameters can be read without waiting for a device.
+
+    Inside torch.func it is always False, since any parameter or depth may be that of one sample of `torch.vmap`.
+    """
+    is_in_func = torch._C._are_functorch_transforms_active()
+    return not is_in_func and eager_values(params.applied.any, of=params.applied) is not None
 
 
 class BatchFlow:

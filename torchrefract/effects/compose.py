@@ -1,6 +1,6 @@
 """Several effects in a row, with one sampling for all warps that follow one another."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
@@ -62,7 +62,7 @@ class Compose(Effect):
 
     def __init__(
         self,
-        effects: Sequence[Effect],
+        effects: Iterable[Effect],
         *,
         padding: str | None = None,
         interpolation: str | None = None,
@@ -71,6 +71,9 @@ class Compose(Effect):
         p: float = 1.0,
     ):
         super().__init__(p=p)
+        if not isinstance(effects, Iterable):
+            raise TypeError(f"effects must be a list of effects, got {type(effects).__name__}")
+        effects = list(effects)
         if not effects:
             raise ValueError("effects must be at least one effect, got none")
         for effect in effects:
@@ -330,7 +333,7 @@ class OneOf(Compose):
 
     def __init__(
         self,
-        effects: Sequence[Effect],
+        effects: Iterable[Effect],
         *,
         weights: Sequence[float] | None = None,
         padding: str | None = None,
@@ -342,9 +345,10 @@ class OneOf(Compose):
         super().__init__(
             effects, padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p
         )
-        weights = [1.0] * len(effects) if weights is None else weights
-        if len(weights) != len(effects):
-            raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
+        count = len(self.effects)
+        weights = [1.0] * count if weights is None else weights
+        if len(weights) != count:
+            raise ValueError(f"weights must be one number for each of {count} effects, got {len(weights)}")
         self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
 
     def sample_applied(self, stream: random.Stream) -> tuple[Tensor, list[Tensor]]:

@@ -140,9 +140,10 @@ class Effect(nn.Module, ABC):
         if not isinstance(image, Tensor) or is_tv_tensor(image, "Video") or image.ndim not in (3, 4):
             return []
         if image.ndim == 3:
-            return [boxes_of_target(targets)]
+            return [boxes_of_target(targets, size=image.shape[-2:])]
         is_of_each = all(type(target) in (list, tuple) and len(target) == len(image) for target in targets)
-        return [boxes_of_target(sample) for sample in zip(*targets, strict=True)] if is_of_each else []
+        samples = zip(*targets, strict=True) if is_of_each else ()
+        return [boxes_of_target(sample, size=image.shape[-2:]) for sample in samples]
 
     def _move_labels(self, targets: tuple[Any, ...], flow: Tensor | None, inputs: Any) -> tuple[Any, ...]:
         """Return the targets of an image, or of a batch of images, that moved along its flow."""

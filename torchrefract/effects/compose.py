@@ -236,7 +236,8 @@ class Compose(Effect):
         can_measure: bool = True,
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
-        frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
+        frame = request.height, request.width
+        can_measure = can_measure and all(can_read(leaf.params) for leaf in moving)
         can_group = can_measure and not requires_grad([leaf.params for leaf in moving])
         parts: list[FlowPart] = []
         for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(moving))))]:

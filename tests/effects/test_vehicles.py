@@ -80,6 +80,15 @@ def test_boxes_of_a_target_are_those_of_params():
     assert_close(result, effect.apply(image, given).image, rtol=0, atol=1e-6)
 
 
+@pytest.mark.quick
+def test_a_batch_whose_boxes_are_not_in_a_list_of_samples_raises():
+    image, effect = torch.full((2, 3, 40, 60), 0.2), HeterogeneousFog(**DUST, vehicle_labels=(3,))
+    for target in ({"boxes": [boxes(CAR), boxes(PERSON)]}, [{"boxes": boxes(CAR)}]):
+        with pytest.raises(ValueError, match="target must be a list of 2 samples, one for each image, if it holds"):
+            effect(image, target)
+    assert effect(image, {"boxes": None})[1] == {"boxes": None}
+
+
 def test_dust_in_a_composition_takes_the_boxes_and_the_labels_move_along():
     scene = Compose([HeterogeneousFog(**DUST, vehicle_labels=(3,)), Turbulence()])
     target = {"boxes": boxes(CAR, PERSON), "labels": torch.tensor([3, 1])}

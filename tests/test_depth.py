@@ -336,6 +336,12 @@ def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed
     assert_close(depth[0, 0, 90, 100], torch.tensor(1.3 * 200 / 41.0), rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize("shape", [(3, 100, 200), (1, 2, 3, 100, 200)])
+def test_the_corridor_of_images_of_another_shape_raises(shape):
+    with pytest.raises(ValueError, match=r"image must have shape \(B, C, H, W\), got"):
+        CorridorDepth()(torch.zeros(shape))
+
+
 @pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 def test_a_frame_by_day_that_shows_no_sky_ends_near_without_a_column():
     generator = torch.Generator().manual_seed(0)

@@ -236,6 +236,7 @@ def test_pictures_of_many_sizes_are_rejected(call, pictures):
     [
         (("images=none",), "images must be an existing folder of pictures, got none"),
         (("images=.",), "images must be a folder that holds .jpg, .jpeg, .png, .webp, .bmp, got ."),
+        (("images=cameras",), ".webp, .bmp, got cameras, whose folders are not searched; give one of them"),
         (("lens_model=opencv7",), "lens_model must be one of auto, opencv0, .*, division, got 'opencv7'"),
         (("drop_share=2",), "drop_share must be a number in .*, got 2"),
         (("dictionary=DICT",), "board: dictionary must be one of DICT_.*, got 'DICT'"),
@@ -245,7 +246,8 @@ def test_pictures_of_many_sizes_are_rejected(call, pictures):
         ),
     ],
 )
-def test_invalid_options_are_one_line_of_error(call, options, message):
+def test_invalid_options_are_one_line_of_error(call, options, message, tmp_path):
+    (tmp_path / "cameras" / "left").mkdir(parents=True)
     assert re.search(message, call("calibrate", *options).message)
 
 

@@ -235,6 +235,18 @@ def test_a_picture_is_degraded_as_displayed_and_keeps_16_bits(call, tmp_path):
     assert expected.shape == (3, 48, 96)
 
 
+def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, folder):
+    assert call("degrade", *WORDS).code == 0
+    source, target = folder / "raw" / "one" / "b.png", folder / "out" / "one" / "b.png"
+    before = target.read_bytes()
+    write(source, 255 - picture())
+    assert call("degrade", *WORDS).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
+    assert target.read_bytes() != before
+    later = time.time() + 3600
+    os.utime(source, (later, later))  # by the clock of a camera in another time zone
+    assert call("degrade", *WORDS).out.startswith("out: 0 degraded, 3 already existed, 0 skipped")
+
+
 def test_what_is_no_picture_is_named_and_skipped(call, folder):
     (folder / "raw" / "text.jpg").write_text("no picture")
     outcome = call("degrade", *WORDS)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -335,6 +336,12 @@ def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed
     assert_close(depth[0, 0, 90, 100], torch.tensor(1.3 * 200 / 41.0), rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize("shape", [(3, 100, 200), (1, 2, 3, 100, 200)])
+def test_the_corridor_of_images_of_another_shape_raises(shape):
+    with pytest.raises(ValueError, match=r"image must have shape \(B, C, H, W\), got"):
+        CorridorDepth()(torch.zeros(shape))
+
+
 @pytest.mark.filterwarnings("ignore:depth is that of a road")  # scenes assume a depth; the test is of others
 def test_a_frame_by_day_that_shows_no_sky_ends_near_without_a_column():
     generator = torch.Generator().manual_seed(0)
@@ -394,6 +401,20 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     maps[0].unlink()
     message = call("generate", *options, "out=other").message
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
+
+
+def test_a_picture_that_changed_after_its_map_was_written_gets_another_one_but_not_beside_maps_of_others(
+    call, network, tmp_path
+):
+    write_frames(tmp_path)
+    words = ("source=frames", "out=depth", f"network={network('metric')}", "scale_by=model")
+    assert call("estimate_depth", *words).code == 0
+    os.utime(tmp_path / "frames" / "a.png")
+    assert "1 depth maps written" in call("estimate_depth", *words).out
+    assert "0 depth maps written" in call("estimate_depth", *words).out
+    (tmp_path / "depth" / "config.json").unlink()  # as of maps of another program
+    os.utime(tmp_path / "frames" / "a.png")
+    assert "0 depth maps written" in call("estimate_depth", *words).out
 
 
 def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, memory, tmp_path, monkeypatch):

@@ -120,7 +120,8 @@ def test_a_chain_of_kalibr_is_a_camera_file(call, folder):
     other = replace(CAMERAS["opencv"], fx=60.0)
     write_kalibr(folder / "chain.yaml", {"cam0": CAMERAS["opencv"], "cam1": other})
     message = call("rectify", "input=raw", "camera=chain.yaml").message
-    assert message == "camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None"
+    remedy = "state name in read_camera, or camera_name in rectify, or keep one camera in the file"
+    assert message == f"camera: name must be one of the cameras in chain.yaml: cam0, cam1; got None; {remedy}"
     assert call("rectify", "input=raw", "camera=chain.yaml", "camera_name=cam1").code == 0
     assert read_opencv(folder / "rectified" / "camera.yaml").fx == 60.0
 
@@ -135,6 +136,17 @@ def test_an_interrupted_run_continues(call, folder):
     assert outcome.out.startswith("out: 2 rectified, 1 already existed, 0 skipped")
     assert (folder / "out" / "1.png").read_bytes() == content
     assert (folder / "out" / "2.png").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("crop", ["true", "false"])
+def test_a_picture_that_changed_after_it_was_rectified_is_rectified_again(call, folder, crop):
+    write_opencv(folder / "cam.yaml", CAMERAS["opencv"], covariance=np.diag([0.0] * 4 + [0.3**2, 0.0, 0.0, 0.0]))
+    words = ("input=raw", "camera=cam.yaml", "out=out", f"crop={crop}")
+    assert call("rectify", *words).code == 0
+    before = (folder / "out" / "1.png").read_bytes()
+    cv2.imwrite(str(folder / "raw" / "1.png"), 255 - waves())
+    assert call("rectify", *words).out.startswith("out: 1 rectified, 2 already existed, 0 skipped")
+    assert (folder / "out" / "1.png").read_bytes() != before
 
 
 def test_a_folder_of_another_camera_is_rejected(call, folder):

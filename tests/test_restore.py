@@ -285,7 +285,8 @@ def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
     outcome = call("restore", f"ckpt_path={brighter}", "input=clip.gif", "out=out")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1].startswith("error: input must hold a file that can be restored, got ")
-    assert outcome.err.endswith("clip.gif would give frames of 96 x 63, and videos take even sides only\n")
+    assert "clip.gif would give frames of 96 x 63, and videos take even sides only; crop it first: " in outcome.err
+    assert outcome.err.endswith('ffmpeg -i INPUT -vf "crop=trunc(iw/2)*2:trunc(ih/2)*2" OUTPUT\n')
     assert written(tmp_path / "out") == ["config.json"]
 
 

@@ -155,8 +155,8 @@ class Degraded:
         self._maps: dict[str, Any] = {
             "valid": _from_result(valid),
             "flow": _from_result(flow),
-            "restored": restore,
-            "restore_valid": restore_valid and (lambda result: restore_valid(result, result._read("restored").valid)),
+            "restore_flow": restore,
+            "restore_valid": restore_valid and (lambda d: restore_valid(d, d._read("restore_flow").valid)),
             "restore_residual": residual,
             "folding": folding,
             **dict.fromkeys(_LIGHT),
@@ -197,7 +197,7 @@ class Degraded:
     @property
     def restore_flow(self) -> Any:
         """Return the inverse of the flow, px."""
-        restored = self._read("restored")
+        restored = self._read("restore_flow")
         return None if restored is None else restored.flow
 
     @property
@@ -225,7 +225,7 @@ class Degraded:
             self.params,
             valid=lambda: function(self.valid),
             flow=later("flow"),
-            restore=later("restored", lambda restored: Inverse(*map(function, restored))),
+            restore=later("restore_flow", lambda restored: Inverse(*map(function, restored))),
             restore_valid=later("restore_valid"),
             residual=later("restore_residual"),
             folding=later("folding", lambda folding: Folding(*map(function, folding))),

@@ -20,6 +20,7 @@ def gyroflow(coefficients: tuple[float, ...] = FISHEYE, **changes: Any) -> str:
         "calib_dimension": {"w": 640, "h": 480},
         "orig_dimension": {"w": 1504, "h": 960},
         "input_horizontal_stretch": 1.0,
+        "asymmetrical": True,
         "use_opencv_fisheye": True,
         "fisheye_params": {
             "RMS_error": 0.4,
@@ -69,6 +70,13 @@ def test_a_profile_is_read_as_its_program_defines_it(form, tmp_path, make_camera
     content, lens = PROFILES[form]
     (tmp_path / "profile").write_text(content)
     assert read_camera(tmp_path / "profile") == make_camera(*lens)
+
+
+@pytest.mark.parametrize("stated", [{"asymmetrical": False}, {"asymmetrical": None}])
+def test_a_profile_of_gyroflow_that_is_not_asymmetrical_has_its_principal_point_in_the_middle(stated, tmp_path):
+    (tmp_path / "profile").write_text(gyroflow(**stated))
+    camera = read_camera(tmp_path / "profile")
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (510.25, 505.75, 319.5, 239.5)
 
 
 def lensfun(terms: str, *, kind: str = "", extra: str = "", aspect: str = "4:3") -> str:

@@ -1,4 +1,5 @@
 import errno
+import io
 import random
 import re
 import shlex
@@ -95,6 +96,14 @@ def test_an_interrupt_while_a_command_loads_is_one_line(capsys, monkeypatch):
 
 
 @pytest.mark.quick
+def test_letters_that_a_redirected_output_lacks_are_escaped(monkeypatch):
+    output = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding="cp1252", write_through=True))
+    monkeypatch.setattr(sys, "argv", ["degrade", "--help"])
+    command("degrade", "folder 路 …", "none:none", file=None)()
+    assert output.getvalue() == b"folder \\u8def \x85\n"
+
+
 def test_a_warning_to_the_user_is_one_line(run_main):
     def warn() -> None:
         with warnings.catch_warnings():  # pytest would keep them

@@ -97,13 +97,16 @@ def test_a_folder_is_not_continued_with_another_camera_in_the_file_of_the_scene(
     assert "error: out must be a folder of the same configuration, got out, where files.camera.yaml is" in outcome.err
 
 
-def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder):
+@pytest.mark.parametrize("command", COMMANDS)
+def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder, command):
     exif = Image.Exif()
     exif[0x0112] = 3
     Image.new("RGB", (64, 48)).save(folder / "frames" / "c.jpg", exif=exif)
+    source = ("image=frames", "frames=3") if command == "preview" else COMMANDS[command]
+    suffix = ".apng" if command == "preview" else ""
     warning = "c.jpg. They are read as displayed, and so labels and a camera must be of the displayed pictures"
     for name, words in (("with", PLACE[:1]), ("without", ())):
-        outcome = call("degrade", *COMMANDS["degrade"], FOG, *words, f"out={name}")
+        outcome = call(command, *source, FOG, *words, f"out={name}{suffix}")
         assert outcome.code == 0, outcome.err
         assert (warning in outcome.err) == bool(words)
 
@@ -134,6 +137,7 @@ def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(cal
     options = ("+task=deweather", *data, "trainer.max_epochs=1", "model.network.width=4")
     outcome = call("train", *options, *PLACE, "hydra.run.dir=run")
     assert outcome.code == 0, outcome.err
+    assert "a tag that turns them" not in outcome.err
     config = OmegaConf.load(folder / "run" / "config.yaml")
     expected = presets.cape_town_fog(
         camera=read_camera(folder / "camera.yaml").cropped(left=0, top=8, width=64, height=32), horizon=0.4
@@ -145,6 +149,12 @@ def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(cal
     assert scored.code == 0, scored.err
     assert "as in its own validation" in scored.out
     write_camera(folder / "camera.yaml", 48, 64)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGB", (64, 48)).save(folder / "drives" / "v" / "a.png", exif=exif)
+    again = call("train", *options, *PLACE, "hydra.run.dir=turned", "trainer.accelerator=none")  # checked later
+    assert "rotation of a video): a.png. They are read as displayed, and so labels and a camera must be" in again.err
+    shutil.copy(folder / "frames" / "a.png", folder / "drives" / "v")
     wider = ("trainer.max_epochs=2", "model.network.width=8", "ckpt_path=run/last.ckpt")
     assert "got run/last.ckpt, where " in call("train", *options, *PLACE, *wider).message
     write_camera(folder / "camera.yaml", 32, 64)

@@ -352,8 +352,11 @@ def test_a_truncated_depth_is_one_line_of_error(call, picture, tmp_path):
         assert re.search("damaged|truncated", call("preview", "frame.png", *FOG, f"depth={name}").message)
 
 
-def test_depth_needs_a_picture_and_a_scale(call, picture):
+def test_depth_needs_a_picture_and_a_scale(call, picture, tmp_path):
     assert "depth must be that of a picture, image=…" in call("preview", "depth=depth.npy").message
+    np.save(tmp_path / "d.npy", meters())
+    message = call("preview", "frame.png", *FOG, "depth=d.npy", "depth_scale=0.001").message
+    assert message == "depth_scale must be left out for .npy, whose values are in m, got 0.001 with d.npy"
     assert "depth_scale must be above 0, got 0" in call("preview", "frame.png", "depth=d.png", "depth_scale=0").message
 
 

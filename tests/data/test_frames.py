@@ -62,6 +62,13 @@ def test_links_are_followed_and_each_folder_is_visited_once(tmp_path):
     assert names(FrameFolder(root, size=SIZE)) == ["a/1.png", "b/1.png", "b/2.png"]
 
 
+def test_frames_have_the_names_of_their_folder_beside_a_link_to_it(tmp_path):
+    root = put(tmp_path, "drive_7/1.png", "drive_8/1.png")
+    (root / "current").symlink_to("drive_7", target_is_directory=True)
+    (root / "drive_7" / "next").symlink_to("../drive_8", target_is_directory=True)
+    assert names(FrameFolder(root, size=SIZE)) == ["drive_7/1.png", "drive_8/1.png"]
+
+
 @pytest.mark.parametrize(
     ("stem", "drive"),
     [

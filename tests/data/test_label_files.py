@@ -111,6 +111,14 @@ def test_yolo_files_keep_their_order_and_drop_what_leaves_the_frame(tmp_path):
 
 
 @pytest.mark.quick
+@pytest.mark.parametrize("others", [("a.txt",), ()])
+def test_labels_whose_suffix_has_capital_letters_are_named(tmp_path, others):
+    for name in ("B.TXT", *others):
+        (tmp_path / name).write_text("0 0.5 0.5 0.2 0.2\n")
+    with pytest.raises(UsageError, match=r"labels must end in .txt or .png, got B.TXT in .*; rename them$"):
+        read_labels(tmp_path, fill=255)
+
+
 @pytest.mark.parametrize(
     "line",
     [
@@ -211,6 +219,8 @@ def test_a_json_of_coco_may_have_sizes_as_text_and_other_entries(tmp_path):
     [
         ({"images": None}, "labels must be a COCO JSON with images"),
         ({"annotations": [{"id": 1}]}, "KeyError: 'image_id'"),
+        ({"categories": None}, "TypeError: file_name must be a text and categories a list"),
+        ({"images": [{"id": 0, "file_name": None, "height": 1, "width": 1}]}, "TypeError: file_name must be a text"),
         ({"annotations": [BOX | {"image_id": 9}]}, "an image for each annotation, got image_id 9, which"),
         ({"annotations": [BOX | {"image_id": 0, "bbox": [1, 2, 3]}]}, "annotation 1 has a bbox that is not"),
         ({"annotations": [BOX | {"image_id": 0, "segmentation": [[1, 2, 3, 4]]}]}, "has a segmentation that is not"),

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from av.codec.context import Flags
-from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps, PngImagePlugin
 
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import FrameFolder
@@ -208,6 +208,25 @@ def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, 
         assert np.abs(as_pixels(frame) - as_pixels(original)).mean() < 3
 
 
+def test_whole_seconds_before_the_first_frame_and_sound_are_left_out(tmp_path):
+    first, source, target = tmp_path / "a.ts", tmp_path / "b.ts", tmp_path / "c.mp4"
+    write(first, [page(k) for k in range(8)], times=[40 * k for k in range(8)], sound="aac")
+    with media_file(first) as original, media_file(source, "w") as shifted:
+        copies = {stream: shifted.add_stream_from_template(stream) for stream in original.streams}
+        for packet in original.demux():
+            if packet.dts is not None:
+                packet.pts += int(9000 / packet.time_base)  # the camera was switched on 2.5 h before
+                packet.dts += int(9000 / packet.time_base)
+                packet.stream = copies[packet.stream]
+                shifted.mux(packet)
+    assert times_of(source)[0] >= 9000
+    assert convert_video(source, target, change=unchanged) == 8
+    assert times_of(target) == pytest.approx([t % 1 for t in times_of(source)], abs=1e-3)
+    (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
+    assert times_of(target)[0] - new_start == pytest.approx(times_of(source)[0] - start, abs=1e-3)
+    assert new_samples.shape == samples.shape
+
+
 @pytest.mark.parametrize(("space", "pix_fmt"), [(1, "yuv420p"), (5, "yuv420p"), (9, "yuv420p"), (2, "yuvj420p")])
 def test_colors_are_read_by_the_matrix_and_range_of_the_video_and_kept(tmp_path, space, pix_fmt):
     flat = np.full((32, 48, 3), (200, 60, 30), np.uint8)
@@ -327,6 +346,19 @@ def test_what_a_video_loses_is_described(tmp_path):
         assert convert_video(file, tmp_path / "b.mp4", change=unchanged) == 1
 
 
+def test_a_sound_and_a_video_of_an_unknown_codec_are_named(tmp_path):
+    write(tmp_path / "a.mov", [page()], sound="aac")
+    data = (tmp_path / "a.mov").read_bytes()
+    (tmp_path / "phone.mov").write_bytes(data.replace(b"mp4a", b"apac").replace(b"esds", b"????"))
+    (tmp_path / "video.mov").write_bytes(data.replace(b"avc1", b"????"))
+    loss = "a sound of a codec that FFmpeg does not know is not kept: phone.mov"
+    assert describe_losses([tmp_path / "phone.mov", tmp_path / "video.mov"], upright=True) == [loss]
+    assert convert_video(tmp_path / "phone.mov", tmp_path / "b.mp4", change=unchanged) == 1
+    assert video_info(tmp_path / "video.mov") == (0, 0.0)
+    with pytest.raises(UnreadableImageError, match=r"video\.mov is not a video with a frame that can be decoded"):
+        convert_video(tmp_path / "video.mov", tmp_path / "c.mp4", change=unchanged)
+
+
 def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
     write(tmp_path / "a.avi", [page(k) for k in range(6)], codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
     data = bytearray((tmp_path / "a.avi").read_bytes())
@@ -338,6 +370,10 @@ def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
     # FFmpeg joins the damaged frame with the one after it.
     assert num_frames == 4
     assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.12, 0.16, 0.2], abs=1e-3)
+    with pytest.warns(UserWarning, match="1 damaged frames"):
+        assert is_complete(tmp_path / "a.avi", tmp_path / "b.mp4")  # so that the next run does not convert it again
+    write(tmp_path / "c.avi", [page()] * 7, codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
+    assert not is_complete(tmp_path / "c.avi", tmp_path / "b.mp4")
 
 
 def test_frames_that_change_their_size_raise(tmp_path):
@@ -461,6 +497,25 @@ def test_exif_data_behind_the_pixels_of_a_png_turn_it(tmp_path):
     assert image_header(source).orientation == 1  # its checksum is wrong
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("kind", ["as a long number", "in XMP alone"])
+def test_the_size_in_the_header_is_that_of_the_pixels_whatever_states_the_orientation(tmp_path, suffix, kind):
+    file, exif = tmp_path / f"a{suffix}", Image.Exif()
+    exif[0x010F] = "maker"
+    xmp = (
+        b'<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="6"/>' if "XMP" in kind else b""
+    )
+    data = exif.tobytes() if xmp else b"Exif\0\0MM\0*\0\0\0\b\0\1\1\x12\0\4\0\0\0\1\0\0\0\6\0\0\0\0"
+    info = PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    options: dict[str, Any] = {"pnginfo": info} if suffix == ".png" else {"xmp": xmp}
+    Image.fromarray(page()).save(file, exif=data, **options)
+    height, width = page().shape[:2]
+    expected = (height, width) if xmp else (width, height)  # OpenCV and viewers ignore an orientation of XMP
+    assert image_size(file) == tuple(read_image(file).shape[1:]) == expected
+    assert bool(describe_turned([file])) == (not xmp)
+
+
 @pytest.mark.parametrize("deep", [True, False])
 def test_pictures_in_formats_that_are_not_read_are_warned_of(tmp_path, deep):
     Image.fromarray(page()).save(tmp_path / "a.png")
@@ -472,6 +527,10 @@ def test_pictures_in_formats_that_are_not_read_are_warned_of(tmp_path, deep):
         assert find_media(tmp_path, deep=deep) == [tmp_path / "a.png"]
     with pytest.warns(UserWarning, match="holds 2 pictures"):
         assert len(FrameFolder(tmp_path, size=(8, 12))) == 1
+    for name in ("d.jfif", "e.ppm", "f.PGM", "g.exr", "h.mpeg", "i.asf", "j.h264"):
+        (tmp_path / name).touch()
+    with pytest.warns(UserWarning, match="holds 9 pictures"):
+        find_media(tmp_path, deep=deep)
 
 
 @pytest.mark.parametrize("deep", [True, False])
@@ -490,6 +549,17 @@ def test_a_folder_of_folders_is_an_error_that_says_so_where_they_are_not_searche
     with pytest.raises(UsageError, match=f"got .*{tmp_path.name}, whose folders are not searched; give one of them$"):
         find_media(tmp_path)
     assert find_media(tmp_path, deep=True) == [tmp_path / "drive" / "a.png"]
+
+
+def test_folders_beside_files_are_warned_of_where_they_are_not_searched(tmp_path):
+    for name in ("a.png", "drive/b.png", "rectified/a.png", "calibration/a.png", "notes/c.txt", ".hidden/d.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(page()).save(tmp_path / name, "png")
+    (tmp_path / "rectified" / "config.json").touch()  # as commands write it into their output
+    (tmp_path / "calibration" / "report.md").touch()
+    with pytest.warns(UserWarning, match="holds folders with more files, drive, which are not searched; give each by"):
+        assert find_media(tmp_path) == [tmp_path / "a.png"]
+    assert len(find_media(tmp_path, deep=True)) == 4
 
 
 def test_sixteen_bits_are_kept(tmp_path):

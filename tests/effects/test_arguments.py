@@ -79,6 +79,7 @@ ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (tr.SunGlare, {"color": (1.0, 2000.0, 1.0)}, "color must be a number in"),
     (tr.ThinPlateSpline, {"smoothing_range": (-1.0, 1.0)}, "smoothing_range must be"),
     (tr.ThinPlateSpline, {"lattice": (1, 4)}, "lattice must be at least 2, got 1"),
+    (tr.ThinPlateSpline, {"lattice": 4}, r"lattice must be \(rows, columns\), got 4"),
     (tr.Turbulence, {"aperture_range": (-1.0, 1.0)}, "aperture_range must be"),
     (tr.Turbulence, {"covariance": "spherical"}, "covariance must be one of exponential, gaussian, matern32, matern52"),
     (tr.Turbulence, {"normalize": "max"}, "normalize must be one of theory, image"),

@@ -32,6 +32,7 @@ SINGLE: dict[str, Effect] = {
 COMPOSED: dict[str, Effect] = {
     "compose": tr.Compose(list(SINGLE.values())),
     "one of": tr.OneOf(list(SINGLE.values())),
+    "blurred turbulence": tr.BlurredTurbulence(tr.PhysicalTurbulence(cn2_range=(1e-11, 3e-11), focal=40.0)),
     "with p of 0.5": tr.Compose(
         [tr.LensDistortion(p=0.5), tr.Turbulence(**FIELD, **FAST, p=0.5), tr.UniformFog(p=0.5)]
     ),

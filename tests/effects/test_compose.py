@@ -334,7 +334,20 @@ def test_all_maps_can_be_read_in_one_graph():
 
 
 @pytest.mark.quick
+def test_effects_may_come_from_an_iterator():
+    image, effects = picture(1, 3, 8, 9), [LensDistortion(), UniformFog()]
+    assert len(Compose(iter(effects)).effects) == len(OneOf(iter(effects)).effects) == 2
+    assert torch.equal(
+        Compose(iter(effects)).degrade(image, seed=1).image, Compose(effects).degrade(image, seed=1).image
+    )
+    with pytest.raises(ValueError, match="effects must be at least one effect, got none"):
+        Compose(iter([]))
+
+
+@pytest.mark.quick
 def test_invalid_effects_and_weights_raise():
+    with pytest.raises(TypeError, match="effects must be a list of effects, got UniformFog"):
+        Compose(UniformFog())  # pyright: ignore[reportArgumentType]  # the invalid argument
     with pytest.raises(TypeError, match="effects must be effects of torchrefract, got Identity"):
         Compose([torch.nn.Identity()])  # pyright: ignore[reportArgumentType]  # the invalid argument
     for weights, rule in (([1.0], "weights must be one number for each of 2"), ([1.0, -1.0], "weights must be")):

@@ -499,6 +499,13 @@ def test_params_repeat_the_result_bit_for_bit(case):
     assert_equal_maps(maps_of(effect.apply(other, drawn.params)), maps_of(effect.degrade(other, seed=7)))
 
 
+@pytest.mark.quick
+def test_a_result_says_which_maps_it_has(case):
+    degraded = case.strong().degrade(random_image(1, 3, 8, 9), seed=7)
+    for name in ("valid", "flow", "restore_flow", "restore_valid", "restore_residual", "folding", "intensity"):
+        assert degraded.has(name) == (getattr(degraded, name) is not None), name
+
+
 def test_params_convert_their_floating_fields(case):
     params = case.strong(p=0.5).sample(random_image(3, 3, 8, 9, dtype=torch.float64), seed=7)
     single = params.to(torch.float32)

@@ -142,6 +142,22 @@ def test_vmap_computes_each_pixel_of_a_composition_that_is_else_measured():
     assert 1e-4 < difference.max() < TOLERANCE_PX
 
 
+def test_vmap_over_one_parameter_or_over_images_of_a_composition_equals_each():
+    image, effect = random_frames(1, 3), tr.Compose([tr.Turbulence(depth=tr.CorridorDepth()), tr.LensDistortion()])
+    params = effect.sample(image, seed=7)
+
+    def flow_of(amplitude: Tensor) -> Tensor:
+        turbulence = params.children[0]._replace(amplitude=amplitude)
+        return effect.apply(image, params._replace(children=(turbulence, params.children[1]))).flow
+
+    amplitudes = torch.tensor([[0.5], [1.4]])
+    expected = torch.stack([flow_of(amplitude) for amplitude in amplitudes])
+    assert_close(torch.vmap(flow_of)(amplitudes), expected, rtol=0, atol=2 * TOLERANCE_PX)
+    images = random_frames(2, 3)
+    expected = torch.stack([effect.apply(each[None], params).image for each in images])
+    assert_close(torch.vmap(lambda each: effect.apply(each[None], params).image)(images), expected, rtol=0, atol=0.01)
+
+
 def test_autocast_changes_nothing(effect):
     image = random_frames(3, 3)
     with torch.autocast("cpu", dtype=torch.bfloat16):

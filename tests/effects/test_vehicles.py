@@ -54,6 +54,21 @@ def test_dust_is_thicker_behind_the_vehicles_of_a_target():
 
 
 @pytest.mark.quick
+def test_boxes_of_another_canvas_than_the_image_raise():
+    effect = HeterogeneousFog(**DUST, vehicle_labels=(3,))
+    rule = r"BoundingBoxes must have the canvas size of the image, \(80, 120\), got \(40, 60\)"
+    with pytest.raises(ValueError, match=rule):
+        effect(torch.full((3, 80, 120), 0.2), {"boxes": boxes(CAR), "labels": [3]})
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", ["class_id", "class_ids", "category_ids", "class_labels", "cls", "gt_classes"])
+def test_classes_have_the_names_of_other_data_sets_too(name):
+    effect = HeterogeneousFog(**DUST, vehicle_labels=(3,))
+    assert thicker(effect, {"boxes": boxes(CAR, PERSON), name: torch.tensor([3, 1])}) == [True, False]
+
+
+@pytest.mark.quick
 def test_boxes_of_a_target_are_those_of_params():
     image, effect = torch.rand(2, 3, 40, 60), HeterogeneousFog(**DUST, vehicle_labels=(3,))
     targets = [{"boxes": boxes(CAR), "labels": [3]}, {"boxes": boxes(PERSON, CAR, CAR), "labels": [1, 3, 3]}]
@@ -63,6 +78,15 @@ def test_boxes_of_a_target_are_those_of_params():
     row = torch.tensor(CAR) - 0.5
     given = params._replace(vehicles=torch.stack([torch.stack([row, 0 * row]), torch.stack([row, row])]))
     assert_close(result, effect.apply(image, given).image, rtol=0, atol=1e-6)
+
+
+@pytest.mark.quick
+def test_a_batch_whose_boxes_are_not_in_a_list_of_samples_raises():
+    image, effect = torch.full((2, 3, 40, 60), 0.2), HeterogeneousFog(**DUST, vehicle_labels=(3,))
+    for target in ({"boxes": [boxes(CAR), boxes(PERSON)]}, [{"boxes": boxes(CAR)}]):
+        with pytest.raises(ValueError, match="target must be a list of 2 samples, one for each image, if it holds"):
+            effect(image, target)
+    assert effect(image, {"boxes": None})[1] == {"boxes": None}
 
 
 def test_dust_in_a_composition_takes_the_boxes_and_the_labels_move_along():
@@ -79,7 +103,7 @@ def test_dust_in_a_composition_takes_the_boxes_and_the_labels_move_along():
 def test_boxes_of_every_format_are_upright_boxes_from_the_center_of_the_first_pixel():
     for form, row in (("XYWH", [20.0, 14.0, 11.0, 9.0]), ("XYXYXYXY", [20.0, 14, 31, 14, 31, 23, 20, 23])):
         target = tv_tensors.BoundingBoxes(torch.tensor([row]), format=form, canvas_size=(40, 60))  # pyright: ignore[reportCallIssue]  # as above
-        assert_close(boxes_of_target([target]).boxes, torch.tensor([CAR]) - 0.5, rtol=0, atol=1e-5)
+        assert_close(boxes_of_target([target], size=(40, 60)).boxes, torch.tensor([CAR]) - 0.5, rtol=0, atol=1e-5)
 
 
 @pytest.mark.quick

@@ -243,6 +243,22 @@ def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(call, t
     assert not list(tmp_path.glob("out/results*"))
 
 
+def test_masks_of_0_and_255_whose_255_is_not_scored_are_warned_of(call, tmp_path, frames):
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((72, 128), np.uint8)
+    (tmp_path / "classes.py").write_text(
+        "import torch\n\ndef segment(images):\n    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)\n"
+    )
+    words = ("robustness.__main__", "model=classes:segment", "data=frames", "scene=cheap_dashcam", "severity=1")
+    for value, is_warned in ((255, True), (1, False)):
+        mask[:, 64:] = value
+        for path in frames.iterdir():
+            cv2.imwrite(str(tmp_path / "masks" / path.name), mask)
+        outcome = call(*words, "labels=masks", f"out=out{value}")
+        assert outcome.code == 0, outcome.err
+        assert ("at most one class beside 255, which is not scored, so that the scores say" in outcome.err) == is_warned
+
+
 def test_masks_and_modules_are_taken(call, tmp_path, frames):
     masks = tmp_path / "masks"
     masks.mkdir()

@@ -273,6 +273,18 @@ def test_the_camera_and_the_horizon_are_those_of_each_scene(call, tmp_path, fram
     assert (about["camera"]["fx"], about["camera"]["width"], about["horizon"]) == (80.0, 64, 0.4)
 
 
+def test_pictures_that_a_tag_turns_are_warned_of_beside_a_camera(call, tmp_path, frames):
+    write_opencv(tmp_path / "camera.yaml", CAMERA)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGB", (64, 36)).save(frames / "0.jpg", exif=exif)
+    words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "limit=1")
+    for out, camera in (("with", ["camera=camera.yaml"]), ("without", [])):
+        outcome = call(*words, *camera, f"out={out}")
+        assert outcome.code == 0, outcome.err
+        assert ("(EXIF orientation, or rotation of a video): 0.jpg. They are read as" in outcome.err) == bool(camera)
+
+
 def test_a_run_is_not_continued_with_another_camera_or_horizon(call, tmp_path, frames):
     words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "camera=camera.yaml", "horizon=0.5")
     write_opencv(tmp_path / "camera.yaml", CAMERA)

@@ -83,7 +83,8 @@ class Camera:
 
         Args:
             matrix: (3, 3), an array or nested lists.
-            coefficients: 4, 5, 8, 12 or 14 numbers, an array of any shape or nested lists.
+            coefficients: 4, 5, 8, 12 or 14 numbers, an array of any shape or nested lists; 4 are k1, k2, p1, p2. The 4
+                of `cv2.fisheye.calibrate` describe another lens: use `Camera(..., model="fisheye")`.
 
         Raises:
             ValueError: the matrix is not 3 x 3 or has skew; see also `Camera`.

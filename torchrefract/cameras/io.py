@@ -103,7 +103,10 @@ def read_camera(
         raise ValueError(f"{unused[0]} must be None for a file of {form.program}, got {given[unused[0]]!r} with {path}")
     chosen = [camera for key, camera in form.cameras.items() if name is None or str(name) == str(key)]
     if len(chosen) != 1:
-        raise ValueError(f"name must be one of the cameras in {path}: {list_names(form.cameras)}; got {name!r}")
+        raise ValueError(
+            f"name must be one of the cameras in {path}: {list_names(form.cameras)}; got {name!r}; state name "
+            "in read_camera, or camera_name in rectify, or keep one camera in the file"
+        )
     given.pop("name", None)
     return chosen[0](**given)
 

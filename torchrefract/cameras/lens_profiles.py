@@ -68,8 +68,10 @@ def vins_camera(document: Document) -> Camera:
 def gyroflow_camera(document: Document) -> Camera:
     """Return the camera of a Gyroflow lens profile, of frames of calib_dimension.
 
-    opencv_fisheye becomes "fisheye" and opencv_standard "opencv". Profiles of stretched frames, of a digital lens
-    (GoPro's SuperView), of several focal lengths, and of other distortion models raise ValueError.
+    opencv_fisheye becomes "fisheye" and opencv_standard "opencv". The principal point is the middle of the frame unless
+    the profile is asymmetrical: Gyroflow ignores the stored one, which is that of another specimen. Profiles of
+    stretched frames, of a digital lens (GoPro's SuperView), of several focal lengths, and of other distortion models
+    raise ValueError.
     """
     values = {"distortion_model": "opencv_fisheye"} | {k: v for k, v in document.values.items() if v is not None}
     document = Document(document.path, values)
@@ -93,7 +95,10 @@ def gyroflow_camera(document: Document) -> Camera:
     if not any(coefficients):
         model, coefficients = "opencv", [0.0] * 4
     width, height = *size.integers("w"), *size.integers("h")
-    return document.camera((width, height), lens.pinhole("camera_matrix"), coefficients, model)
+    fx, fy, *center = lens.pinhole("camera_matrix")
+    if not values.get("asymmetrical"):
+        center = (width - 1) / 2, (height - 1) / 2
+    return document.camera((width, height), (fx, fy, *center), coefficients, model)
 
 
 def metashape_camera(path: Path, root: ElementTree.Element) -> Camera:

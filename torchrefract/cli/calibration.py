@@ -48,6 +48,7 @@ from torchrefract.data import media
 from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
+    describe_folders,
     files_in,
     image_header,
     is_lost,
@@ -126,7 +127,8 @@ def find_pictures(folder: str | Path) -> list[Path]:
     if not (folder := Path(folder)).is_dir():
         raise UsageError(f"images must be an existing folder of pictures, got {folder}")
     if not (files := files_in(folder)):
-        raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}")
+        remedy = describe_folders(folder)
+        raise UsageError(f"images must be a folder that holds {', '.join(EXTENSIONS)}, got {folder}{remedy}")
     return files
 
 
@@ -311,7 +313,9 @@ def rectify(cfg: DictConfig) -> None:
         if part is None or media.is_video(file):
             return media.is_complete(file, target)
         with suppress(UnreadableImageError):
-            return image_header(target).size == part.size(image_header(file).size[1], camera.width)
+            return not media.is_older(target, file) and (
+                image_header(target).size == part.size(image_header(file).size[1], camera.width)
+            )
         return False
 
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:

@@ -1,6 +1,7 @@
 """Main functions of the commands. This module imports only the standard library: a bare wheel lacks all others."""
 
 import importlib
+import io
 import signal
 import sys
 import textwrap
@@ -36,6 +37,9 @@ def command(
     """
 
     def main() -> None:
+        # A redirected output has few letters on Windows, and a name with others would stop a run.
+        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+            sys.stdout.reconfigure(errors="backslashreplace")
         if any(argument in _HELP for argument in sys.argv[1:]):
             options = _HYDRA.format(sweeps=_SWEEPS if has_sweeps else "", file=file)
             print("\n\n".join([(page or "").strip(), *([textwrap.fill(options, 120)] if file else [])]))

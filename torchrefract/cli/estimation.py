@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import make_folder, matching_files, relative_name
+from torchrefract._io import is_remote, make_folder, matching_files, relative_name
 from torchrefract._validation import UsageError, check_count, first_names
 from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
@@ -97,15 +97,21 @@ def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
 def _missing_frames(
     files: Iterable[Path], root: Path, folder: DepthFolder, skipped: dict[str, str]
 ) -> Iterator[_Frame]:
-    """Yield the frames that have no map yet; name those that cannot be read."""
+    """Yield the frames that have no map yet, or changed since; name those that cannot be read."""
+    # Maps of another program may be older than copies of its frames.
+    is_claimed = not is_remote(folder.root) and (folder.root / "config.json").is_file()
+
+    def has_map(file: Path, name: str, index: int | None = None) -> bool:
+        return folder.has(name, index) and not (is_claimed and media.is_older(folder.path(name, index), file))
+
     for file in files:
         name = relative_name(file, root)
         try:
             if media.is_video(file):
                 for index, image in media.read_video(file, count()):
-                    if not folder.has(name, index):
+                    if not has_map(file, name, index):
                         yield _Frame(image[0], folder.path(name, index), f"{name}#{index}")
-            elif not folder.has(name):
+            elif not has_map(file, name):
                 yield _Frame(read_image(file), folder.path(name), name)
         except UnreadableImageError as error:
             _skip(skipped, name, str(error))

@@ -30,7 +30,7 @@ from torchrefract._validation import (
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, warn_of_assumed_depth
+from torchrefract.cli.command import check_none_lost, print_warning, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_memory,
     check_seed,
@@ -47,6 +47,7 @@ from torchrefract.cli.options import (
 )
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, opened
+from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.card import summarize, write_card
 from torchrefract.data.pairs.configuration import check_shards, claim, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
@@ -75,6 +76,7 @@ _T = TypeVar("_T")
 
 _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the manifest state all
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
+_TAGS = 16  # frames whose orientation is read beside a camera
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
 _VERSIONS = {"torch": torch.__version__, "numpy": np.__version__, "opencv": cv2.__version__}
 _MESSAGE_INTERVAL = 60.0  # seconds
@@ -213,6 +215,11 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     listed, write_list = _list_frames(cfg, source, out, plain)
     num_pairs = listed.num_frames if count is None else count
     sources = listed.limited(num_pairs)
+    if cfg.scene.get("camera") is not None:
+        # The header of each frame would cost a large set minutes.
+        paths = {source.path: sources.root / source.path for source in sources.limited(_TAGS).frames()}
+        if turned := describe_turned([*paths.values()], upright=True):
+            print_warning(turned)
     if (depth := depth_folder(cfg)) is not None:
         check_memory(workers, depth=depth.root)
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}

@@ -17,7 +17,7 @@ from torchrefract.cli.command import print_warning, progress, warn_of_assumed_de
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
 from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
 from torchrefract.data.images import EXTENSIONS, files_in, fit, natural_order, read_image
-from torchrefract.data.media import VIDEOS, read_video
+from torchrefract.data.media import VIDEOS, describe_turned, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.visualization.animation import (
@@ -99,6 +99,10 @@ def _source(cfg: DictConfig) -> _Source:
         return _Source(_repeat(image, max_frames), depth, "a rendered road scene, as no picture was given", "")
     path = Path(str(cfg.image))
     (frames, maps), name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
+    if cfg.scene is not None and cfg.scene.get("camera") is not None:
+        files = [path / name for name, _ in maps] if path.is_dir() else [path]
+        if turned := describe_turned(files, upright=True):
+            print_warning(turned)
     depth, note = (None, "") if cfg.depth is None else _depth(cfg, frames, maps, size)
     resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
     return _Source(resized, depth, name, note)

@@ -28,6 +28,7 @@ from torchrefract.cli.command import check_none_lost, print_warning, progress
 from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
+    check_drives,
     check_seed,
     check_task_options,
     find_device,
@@ -41,8 +42,6 @@ from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
-    check_frame_of_camera,
-    image_size,
     is_lost,
     pixels_of,
     read_image,
@@ -261,12 +260,11 @@ def _place_scene(cfg: DictConfig) -> Camera | None:
 
 
 def _check_camera(camera: Camera, data: PairData) -> None:
-    """Raise UsageError if the first frame of a drive, which has one camera, has another shape than the camera's."""
+    """Check the camera of the frames as `check_drives` does, and warn of frames that a tag turns."""
     for frames in (data.train, data.val):
         assert isinstance(frames, FrameFolder)  # as `_place_scene` checked
-        for frame in dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values():
-            height, width = image_size(frame)
-            check_frame_of_camera(camera, str(frame), height=height, width=width)
+        if turned := check_drives(camera, frames):
+            print_warning(turned)
 
 
 def _save_config(cfg: DictConfig, trainer: Trainer) -> None:

@@ -57,6 +57,7 @@ from torchrefract.data.label_files import (
     boxes_of_yolo,
     read_labels,
 )
+from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.corruption_error import BaseComparison, compare_with_base
@@ -71,6 +72,7 @@ from torchrefract.robustness.scores import (
     detection_score,
     segmentation_score,
 )
+from torchrefract.robustness.set_scores import IGNORED_CLASS
 
 _SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
@@ -86,6 +88,7 @@ class _Folder(NamedTuple):
     labels: CocoLabels | LabelFolder | None
     depths: DepthFolder | None
     skipped: list[str]  # why pictures cannot be read
+    classes: set[int]  # the lowest and highest class of the masks that were read, and the ignored one if they hold it
     place: dict[str, Any]  # arguments of the scenes
     device: torch.device  # of the images, and so of the effects
 
@@ -113,6 +116,10 @@ class _Folder(NamedTuple):
             check_frame_of_camera(self.camera, name, height=image.shape[1], width=image.shape[2])
             with naming("labels"):
                 target = None if self.labels is None else _target(self.labels.of(name), image)
+            if isinstance(target, tv_tensors.Mask):
+                scored = target[target != IGNORED_CLASS]
+                self.classes.update(map(int, scored.aminmax()) if len(scored) else ())
+                self.classes.update([IGNORED_CLASS] if len(scored) < target.numel() else ())
             yield name, image.to(self.device), target
 
 
@@ -221,7 +228,12 @@ def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> Non
 
 
 def _check_clean(result: Robustness, folder: _Folder) -> None:
-    """Raise UsageError if the scores of the clean pictures say nothing about the model."""
+    """Raise UsageError if the scores of the clean pictures say nothing about the model; warn of masks of one class."""
+    if IGNORED_CLASS in folder.classes and len(folder.classes) < 3:
+        print_warning(
+            f"the masks hold at most one class beside {IGNORED_CLASS}, which is not scored, so that the scores say "
+            f"nothing: give what the masks show as {IGNORED_CLASS} another class, such as 1"
+        )
     if not result.clean.any():
         raise UsageError("model must score above 0 on a clean picture, got 0 on all: check labels and classes")
     if folder.labels is None and np.isnan(result.set_scores[None].get("mAP", 0.0)):
@@ -268,7 +280,10 @@ def _folder(cfg: DictConfig) -> _Folder:
     names = names[: read_optional(cfg, "limit", check_count)]
     if (depths := depth_folder(cfg)) is not None:
         depths.check((name, None) for name in names)
-    return _Folder(path, names, labels, depths, [], read_place(cfg), find_device(str(cfg.device)))
+    place = read_place(cfg)
+    if (labels or "camera" in place) and (turned := describe_turned([path / name for name in names], upright=True)):
+        print_warning(turned)
+    return _Folder(path, names, labels, depths, [], set(), place, find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:

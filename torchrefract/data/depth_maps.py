@@ -121,6 +121,8 @@ def read_depth(path: Path, *, scale: float = STEP) -> tuple[Tensor, float]:
         UsageError, UnreadableImageError: the file is not such a map.
     """
     if path.suffix.lower() == ".npy":
+        if scale != STEP:
+            raise UsageError(f"depth_scale must be left out for .npy, whose values are in m, got {scale:g} with {path}")
         stored = _read_npy(path)
         depth = np.where(stored == 0, np.inf, stored).astype(np.float32)
     else:

@@ -222,16 +222,18 @@ def list_names(root: Path) -> Iterator[str]:
     if is_remote(root):
         yield from sizes_in_store(root)
         return
-    visited = set()
-    for folder, subfolders, files in os.walk(root, followlinks=True, onerror=_raise_permission_error):
-        status = os.stat(folder)
-        is_new = (status.st_dev, status.st_ino) not in visited  # links may form a loop, or lead to a folder twice
-        visited.add((status.st_dev, status.st_ino))
-        subfolders[:] = sorted(name for name in subfolders if is_new and not name.startswith("."))
-        inner = Path(folder).relative_to(root).as_posix()
-        prefix = "" if inner == "." else f"{inner}/"
-        # A path object for each file would take longer than the scan.
-        yield from (prefix + name for name in files if is_new and not name.startswith("."))
+    visited, starts = set(), [str(root)]
+    for start in starts:  # links come last, so that files have the names of their folders and not of a link to them
+        for folder, subfolders, files in os.walk(start, onerror=_raise_permission_error):
+            status = os.stat(folder)
+            is_new = (status.st_dev, status.st_ino) not in visited  # links may form a loop, or lead to a folder twice
+            visited.add((status.st_dev, status.st_ino))
+            subfolders[:] = sorted(name for name in subfolders if is_new and not name.startswith("."))
+            starts += filter(os.path.islink, [os.path.join(folder, name) for name in subfolders])
+            inner = Path(folder).relative_to(root).as_posix()
+            prefix = "" if inner == "." else f"{inner}/"
+            # A path object for each file would take longer than the scan.
+            yield from (prefix + name for name in files if is_new and not name.startswith("."))
 
 
 def _raise_permission_error(error: OSError) -> NoReturn:

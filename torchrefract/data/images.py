@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchrefract._io import is_remote, local_file, read_bytes, retried, store_of
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract._validation import UsageError, check_size, check_tensor, warn
+from torchrefract._validation import UsageError, check_size, check_tensor, first_names, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.jpeg import START_OF_SCAN, lacks_pixel_data
 
@@ -31,7 +31,9 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
 # Pictures and videos that no reader here takes, in folders that hold others.
 _UNREAD = (".heic", ".heif", ".tif", ".tiff", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw")
-_UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360")
+_UNREAD += (".jfif", ".jpe", ".ppm", ".pgm", ".pnm", ".tga", ".exr", ".hdr")
+_UNREAD += (".wmv", ".flv", ".vob", ".insv", ".360", ".mpeg", ".asf", ".ogv", ".3g2", ".mxf", ".h264", ".hevc", ".dav")
+_OUTPUTS = ("config.json", "report.md")  # in the folders that commands write pictures to
 _TAIL = 4096  # bytes at the end that are searched first for an end marker
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
@@ -112,8 +114,12 @@ def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tens
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
     # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
-    _read_header(path, io.BytesIO(data))
-    return to_float(torch.from_numpy(_decode(path, data, upright=upright))).permute(2, 0, 1)
+    orientation, pixels = _read_header(path, io.BytesIO(data)).orientation, _decode(path, data)
+    if upright and orientation != 1:
+        # OpenCV reads some orientations otherwise than Pillow, and then sizes would not be those of the header.
+        pixels = pixels.swapaxes(0, 1) if orientation in _TRANSPOSED else pixels
+        pixels = pixels[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1].copy()
+    return to_float(torch.from_numpy(pixels)).permute(2, 0, 1)
 
 
 def exif_of_result(header: ImageHeader, *, upright: bool) -> bytes:
@@ -209,12 +215,32 @@ def local_copy(path: Path) -> Iterator[Path]:
 def files_in(folder: Path, suffixes: Sequence[str] = EXTENSIONS) -> list[Path]:
     """List the files of a folder with some suffixes, in any case, sorted by name, without folders and hidden files.
 
-    Raises PermissionError if the folder cannot be read, and warns as `warn_of_unread` does.
+    Raises PermissionError if the folder cannot be read. Warns as `warn_of_unread` does, and of folders beside the files
+    that hold such files, too.
     """
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if not entry.name.startswith(".") and not entry.is_dir()]
+        is_folder = {entry.name: entry.is_dir() for entry in entries if not entry.name.startswith(".")}
+    names = [name for name in is_folder if not is_folder[name]]
     warn_of_unread(folder, names)
-    return sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
+    files = sorted(folder / name for name in names if Path(name).suffix.lower() in suffixes)
+    inner = sorted(name for name in is_folder if is_folder[name] and _holds_inputs(folder / name, suffixes))
+    if files and inner:
+        warn(
+            f"{folder} holds folders with more files, {first_names(inner)}, which are not searched; give each by itself"
+        )
+    return files
+
+
+def describe_folders(folder: Path) -> str:
+    """Return the end of a message on a folder without files of some suffixes: its folders, if any, are not searched."""
+    has_folders = any(path.is_dir() for path in folder.iterdir())
+    return ", whose folders are not searched; give one of them" if has_folders else ""
+
+
+def _holds_inputs(folder: Path, suffixes: Sequence[str]) -> bool:
+    """Return True if a folder holds files with some suffixes and is not the output of a command."""
+    names = os.listdir(folder) if os.access(folder, os.R_OK) else []
+    return not {*_OUTPUTS}.intersection(names) and any(Path(name).suffix.lower() in suffixes for name in names)
 
 
 def natural_order(name: str) -> list[str | int]:
@@ -312,13 +338,13 @@ def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
         with Image.open(stream) as header:
             width, height = header.size
             info = header.info
-            # Without the first test, Pillow decodes a whole PNG to search for EXIF data behind its pixels.
-            tags = header.getexif() if "exif" in info else Image.Exif()
             num_frames, has_alpha = getattr(header, "n_frames", 1), header.has_transparency_data
         stream.seek(0)
         head = stream.read(_PNG_DEPTH + 1)
-        if not (exif := info.get("exif", b"")) and (exif := _late_exif(head, stream)):
-            tags.load(exif)
+        # Pillow's getexif decodes a whole PNG to search for EXIF data, and takes an orientation of XMP, which viewers
+        # and OpenCV ignore.
+        exif, tags = info.get("exif") or _late_exif(head, stream), Image.Exif()
+        tags.load(exif)
         orientation = tags.get(_ORIENTATION, 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnreadableImageError(f"{path} has a damaged header ({error})") from error
@@ -342,9 +368,9 @@ def _late_exif(head: bytes, stream: BinaryIO) -> bytes:
     return chunk[4:] if zlib.crc32(chunk) == int.from_bytes(checksum, "big") else b""
 
 
-def _decode(path: str | Path, data: bytes, *, upright: bool) -> np.ndarray:
+def _decode(path: str | Path, data: bytes) -> np.ndarray:
     # From a file instead of memory, OpenCV would fill the missing rows of a truncated JPEG with gray.
-    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
+    mode = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with _silent_opencv():
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), mode)

@@ -211,7 +211,11 @@ def read_labels(path: Path, *, fill: int) -> CocoLabels | LabelFolder:
     """
     if path.is_file() and path.suffix.lower() == ".json":
         return _read_coco(path)
-    kinds = {file.suffix for file in list_files(path) if file.suffix in _SUFFIXES} if path.is_dir() else set()
+    files = list(list_files(path)) if path.is_dir() else []
+    kinds = {file.suffix for file in files} & {*_SUFFIXES}
+    capital = [f.name for f in files if f.suffix != f.suffix.lower() and f.suffix.lower() in (kinds or _SUFFIXES)]
+    if capital:
+        raise UsageError(f"labels must end in .txt or .png, got {first_names(sorted(capital))} in {path}; rename them")
     if len(kinds) != 1:
         content = " and ".join(sorted(kinds)) or ("neither of both" if path.is_dir() else "no such file or folder")
         raise UsageError(
@@ -228,6 +232,8 @@ def _read_coco(path: Path) -> CocoLabels:
         annotations = defaultdict[Any, list[Annotation]](list)
         for annotation in document["annotations"]:
             annotations[annotation["image_id"]].append(annotation)
+        if not {*map(type, images)} <= {str} or not isinstance(document.get("categories", []), list):
+            raise TypeError("file_name must be a text and categories a list")
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise UsageError(
             f"labels must be a COCO JSON with images (id, file_name, width, height) and annotations (image_id), got "

@@ -5,6 +5,7 @@ display matrix) turns them for display. Readers take `upright`: True for the dis
 sensor. Writers keep the tag of a frame of the sensor, so that viewers show every output upright.
 """
 
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
     UnreadableImageError,
+    describe_folders,
     exif_of_result,
     files_in,
     image_header,
@@ -30,6 +32,7 @@ from torchrefract.data.video import (
     can_write_videos,
     convert_video,
     count_frames,
+    decodable_frames,
     is_turned_video,
     read_video,
     video_info,
@@ -46,6 +49,7 @@ __all__ = [
     "describe_turned",
     "find_media",
     "is_complete",
+    "is_older",
     "is_video",
     "output_name",
     "read_video",
@@ -85,8 +89,7 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
         warn_of_unread(source, map(str, candidates))
     files = [file for file in candidates if file.suffix.lower() in suffixes]
     if not files:
-        has_folders = not deep and source.is_dir() and any(path.is_dir() for path in source.iterdir())
-        remedy = ", whose folders are not searched; give one of them" if has_folders else ""
+        remedy = describe_folders(source) if not deep and source.is_dir() else ""
         raise UsageError(f"{name} must be, or hold, {', '.join(suffixes)}, got {source}{remedy}")
     names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:
@@ -119,20 +122,31 @@ def output_name(file: Path) -> Path:
 
 
 def is_complete(file: Path, target: Path, *, num_columns: int = 1) -> bool:
-    """Return True if the output of a file exists and has its number of frames (video) or its sides (picture).
+    """Return True if the output of a file is newer, and has its number of frames (video) or its sides (picture).
 
     The output of a picture may hold several, side by side. A file of a store is not read for it.
     """
     if not target.is_file() or is_remote(file):
         return target.is_file()
+    if is_older(target, file):
+        return False
     if is_video(file):
-        # The header of a trimmed video counts frames that are not shown.
-        return (num := video_info(target)[0]) > 0 and num in (video_info(file)[0], count_frames(file))
+        num = video_info(target)[0]
+        # The header of a trimmed video counts frames that are not shown, and only decoding tells damaged ones.
+        return num > 0 and (num in (video_info(file)[0], count_frames(file)) or num == decodable_frames(file))
     try:
         height, width = image_size(file)
         return image_size(target) == (height, num_columns * width)
     except UnreadableImageError:
         return False
+
+
+def is_older(target: Path, file: Path) -> bool:
+    """Return True if a file exists and was written to after its output."""
+    if not (file.is_file() and target.is_file()):
+        return False
+    # Cameras in another time zone date files into the future, which says nothing.
+    return target.stat().st_mtime_ns < file.stat().st_mtime_ns <= time.time_ns()
 
 
 def describe_losses(files: Sequence[Path], *, upright: bool) -> list[str]:

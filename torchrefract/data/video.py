@@ -78,6 +78,11 @@ def count_frames(path: Path) -> int:
         return sum(packet.size > 0 and not packet.is_discard for packet in _packets(video))
 
 
+def decodable_frames(path: Path) -> int:
+    """Decode a video and count its frames; warns of damaged ones, which are left out."""
+    return sum(1 for _ in _decode(path))
+
+
 def is_turned_video(path: Path) -> bool:
     """Return True if the display matrix of a video turns its frames; False if the file is not a video."""
     first = next(_decode(path), None)
@@ -92,6 +97,8 @@ def video_losses(path: Path) -> Iterator[str]:
         for stream in video.container.streams:
             if stream.type != "audio" and stream is not video:
                 yield f"a stream of type {stream.type} is not kept"
+            elif not _has_codec(stream):
+                yield "a sound of a codec that FFmpeg does not know is not kept"
             elif stream.type == "audio" and stream.codec_context.name not in _sound_codecs():
                 yield f"the sound is not kept, since MP4 cannot hold {stream.codec_context.name}"
         components = video.format.components if video.format else ()
@@ -129,6 +136,9 @@ def convert_video(
 ) -> int:
     """Write the changed frames of a video with their times and its sound; return their number.
 
+    Whole seconds before the first frame and sound are left out: recordings such as MPEG-TS may count from when the
+    camera was switched on, and a player of MP4 would wait for so long.
+
     Args:
         source: the video.
         path: of the new video, ending in .mp4.
@@ -159,7 +169,10 @@ def convert_video(
     picture = next(pictures)
     height, width = picture.shape[:2]
     if height % 2 or width % 2:
-        raise UnreadableImageError(f"{source} would give frames of {width} x {height}, and videos take even sides only")
+        raise UnreadableImageError(
+            f"{source} would give frames of {width} x {height}, and videos take even sides only; crop it first: ffmpeg "
+            '-i INPUT -vf "crop=trunc(iw/2)*2:trunc(ih/2)*2" OUTPUT'
+        )
     with contextlib.ExitStack() as stack:
         video = cast(av.VideoStream, _open(source))
         original = stack.enter_context(cast(InputContainer, video.container))
@@ -171,10 +184,13 @@ def convert_video(
         copies: dict[Stream, Stream] = {
             sound: container.add_stream_from_template(sound)
             for sound in original.streams.audio
-            if sound.codec_context.name in _sound_codecs()
+            if _has_codec(sound) and sound.codec_context.name in _sound_codecs()
         }
-        encoded = _encode(stream, chain([picture], pictures), (times.popleft() for _ in count()))
-        sounds = _copy_packets(copies)
+        start = max(0, original.start_time or 0) // av.time_base  # s
+        shift = round(start / time_base)
+        shifted = ((pts - shift, duration) for pts, duration in (times.popleft() for _ in count()))
+        encoded = _encode(stream, chain([picture], pictures), shifted)
+        sounds = _copy_packets(copies, start)
         return _mux(container, stream, merge(encoded, sounds, key=lambda packet: (packet.dts or 0) * packet.time_base))
 
 
@@ -188,10 +204,15 @@ def _open(path: Path) -> av.VideoStream | None:
         container = av.open(cast(Any, source), metadata_errors="replace")
     except av.FFmpegError:
         return None
-    if isinstance(video := container.streams.best("video"), av.VideoStream):
+    if isinstance(video := container.streams.best("video"), av.VideoStream) and _has_codec(video):
         return video
     container.close()
     return None
+
+
+def _has_codec(stream: Stream) -> bool:
+    """Return True if FFmpeg knows the codec of a stream: not that of the spatial sound of phones, for example."""
+    return stream.codec_context is not None
 
 
 def _decode(path: Path) -> Iterator[av.VideoFrame]:
@@ -237,10 +258,13 @@ def _packets(*streams: Stream) -> Iterator[Packet]:
         warn(f"{container.name} is damaged and ends early ({error.strerror})")
 
 
-def _copy_packets(copies: dict[Stream, Stream]) -> Iterator[Packet]:
-    """Yield the packets of streams, each assigned to the copy of its stream."""
+def _copy_packets(copies: dict[Stream, Stream], start: int) -> Iterator[Packet]:
+    """Yield the packets of streams, each assigned to the copy of its stream, with times from `start`, s, on."""
     for packet in _packets(*copies) if copies else ():
         if packet.dts is not None:  # the last, empty packet of each stream has no time
+            shift = round(start / packet.time_base)
+            packet.dts -= shift
+            packet.pts = None if packet.pts is None else packet.pts - shift
             packet.stream = copies[packet.stream]
             yield packet
 

@@ -139,10 +139,14 @@ class Effect(nn.Module, ABC):
         """Return the boxes in the target of each image; none for clips, whose boxes are not of one frame."""
         if not isinstance(image, Tensor) or is_tv_tensor(image, "Video") or image.ndim not in (3, 4):
             return []
+        size = image.shape[-2:]
         if image.ndim == 3:
-            return [boxes_of_target(targets)]
-        is_of_each = all(type(target) in (list, tuple) and len(target) == len(image) for target in targets)
-        return [boxes_of_target(sample) for sample in zip(*targets, strict=True)] if is_of_each else []
+            return [boxes_of_target(targets, size=size)]
+        if all(type(target) in (list, tuple) and len(target) == len(image) for target in targets):
+            return [boxes_of_target(sample, size=size) for sample in zip(*targets, strict=True)]
+        if len(boxes_of_target(targets, size=size).boxes):
+            raise ValueError(f"target must be a list of {len(image)} samples, one for each image, if it holds boxes")
+        return []
 
     def _move_labels(self, targets: tuple[Any, ...], flow: Tensor | None, inputs: Any) -> tuple[Any, ...]:
         """Return the targets of an image, or of a batch of images, that moved along its flow."""

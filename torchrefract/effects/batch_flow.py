@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import eager_values, requires_grad
@@ -262,8 +263,10 @@ def zero_flow(params: Any, plan: WarpPlan) -> FlowPart:
 
 
 def can_read(params: Any) -> bool:
-    """Return True if the values of parameters can be read without waiting for a device."""
-    return eager_values(params.applied.any, of=params.applied) is not None
+    """Return True if the values of parameters, and of a depth with them, can be read without waiting for a device."""
+    # Inside torch.vmap any of them may be that of one sample, which has no values of its own.
+    values = pytree.tree_leaves(params) if torch._C._are_functorch_transforms_active() else [params.applied]
+    return all(eager_values(value.any, of=value) is not None for value in values if isinstance(value, Tensor))
 
 
 class BatchFlow:

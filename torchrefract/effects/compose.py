@@ -1,6 +1,6 @@
 """Several effects in a row, with one sampling for all warps that follow one another."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
@@ -42,7 +42,7 @@ class Compose(Effect):
     place: the image is sampled before them, and their maps move with the warps after them. Effects that share a
     function from images to depth get the depth of the frame before fog and light, computed once for the first of them;
     samplings move it along, as a depth that is passed. `restore_flow` is the composition of the inverse flows, not
-    valid where it misses by more than 0.5 px, as between the sheets of a fold.
+    valid where it misses by more than 0.1 px, as between the sheets of a fold.
 
     Args:
         effects: at least one; compositions may be nested.
@@ -62,7 +62,7 @@ class Compose(Effect):
 
     def __init__(
         self,
-        effects: Sequence[Effect],
+        effects: Iterable[Effect],
         *,
         padding: str | None = None,
         interpolation: str | None = None,
@@ -71,6 +71,9 @@ class Compose(Effect):
         p: float = 1.0,
     ):
         super().__init__(p=p)
+        if not isinstance(effects, Iterable):
+            raise TypeError(f"effects must be a list of effects, got {type(effects).__name__}")
+        effects = list(effects)
         if not effects:
             raise ValueError("effects must be at least one effect, got none")
         for effect in effects:
@@ -233,7 +236,8 @@ class Compose(Effect):
         can_measure: bool = True,
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
-        frame, can_measure = (request.height, request.width), can_measure and can_read(moving[0].params)
+        frame = request.height, request.width
+        can_measure = can_measure and all(can_read(leaf.params) for leaf in moving)
         can_group = can_measure and not requires_grad([leaf.params for leaf in moving])
         parts: list[FlowPart] = []
         for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(moving))))]:
@@ -330,7 +334,7 @@ class OneOf(Compose):
 
     def __init__(
         self,
-        effects: Sequence[Effect],
+        effects: Iterable[Effect],
         *,
         weights: Sequence[float] | None = None,
         padding: str | None = None,
@@ -342,9 +346,10 @@ class OneOf(Compose):
         super().__init__(
             effects, padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p
         )
-        weights = [1.0] * len(effects) if weights is None else weights
-        if len(weights) != len(effects):
-            raise ValueError(f"weights must be one number for each of {len(effects)} effects, got {len(weights)}")
+        count = len(self.effects)
+        weights = [1.0] * count if weights is None else weights
+        if len(weights) != count:
+            raise ValueError(f"weights must be one number for each of {count} effects, got {len(weights)}")
         self.weights = tuple(check_number("weights", weight, low=1e-9) for weight in weights)
 
     def sample_applied(self, stream: random.Stream) -> tuple[Tensor, list[Tensor]]:

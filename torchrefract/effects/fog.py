@@ -225,7 +225,7 @@ class UniformFog(PhotometricEffect):
         threshold: contrast that remains at the distance V, in (0, 1); 0.05 is the meteorological optical range.
         depth: gives d if no depth is passed in: a provider, or any function from images (B, C, H, W) in [0, 1] to their
             depth (B, 1, H, W) in m, such as a network. None is `LinearDepth()`, the ramp over the rows of the paper.
-        camera: of the frames; with it, depth along its axis is converted to the distance along each ray.
+        camera: of the frames, whose pinhole counts; with it, depth along its axis becomes the distance along each ray.
         linear_light: blend linear light, not stored values (sRGB).
         tolerance: largest error of the image, levels of 1/255; fog too thin to be seen is not computed, see `plan`.
             None is exact. Maps stay exact.

@@ -61,7 +61,7 @@ class NightGlow(PhotometricEffect):
         luminance_range: of a lamp of stored value 1; white is 1.
         threshold: stored value in [0, 0.999], above which a pixel counts as a lamp; cameras show lamps from 0.9 on.
             White paint in the light of headlamps may exceed it.
-        camera: of the frames; None is a pinhole with a focal length of 0.9 widths.
+        camera: of the frames, whose pinhole counts; None is a centered one with a focal length of 0.9 widths.
         tolerance: all of the effect is computed under any tolerance.
         p: probability that a sample is degraded.
 

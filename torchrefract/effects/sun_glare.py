@@ -111,7 +111,7 @@ class SunGlare(PhotometricEffect):
         min_gain: lowest G, in [1/32, 1].
         time_constant_range: of the exposure in a clip, in frames; with 0 each frame is exposed by itself.
         drift_x_range, drift_y_range: of the sun, in widths and heights per frame of a clip.
-        camera: of the frames; None is a pinhole with a focal length of 0.9 widths.
+        camera: of the frames, whose pinhole counts; None is a centered one with a focal length of 0.9 widths.
         tolerance: all of the effect is computed under any tolerance.
         p: probability that a sample is degraded.
 

@@ -1,6 +1,7 @@
 """Smooth bending of the frame by a thin-plate spline."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -76,6 +77,8 @@ class ThinPlateSpline(WarpEffect):
     ):
         super().__init__(padding=padding, interpolation=interpolation, backend=backend, tolerance_px=tolerance_px, p=p)
         self.amplitude_range = check_range("amplitude_range", amplitude_range, low=0.0, high=1e4)
+        if not isinstance(lattice, Sequence) or len(lattice) != 2:
+            raise ValueError(f"lattice must be (rows, columns), got {lattice!r}")
         rows, columns = lattice
         self.lattice = (check_count("lattice", rows, low=2), check_count("lattice", columns, low=2))
         self.smoothing_range = check_range("smoothing_range", smoothing_range, low=0.0, high=1e12)

@@ -179,10 +179,12 @@ class TurbulenceBlur(PhotometricEffect):
         view, largest = self._view(height, width), self._largest_strength
         light = srgb_to_linear(finite_image(image.contiguous()).clamp(0, 1))
         ratio = per_sample(finite_or(params.ratio.to(light.dtype), 0.0).clamp(0.0, 1.05 * _LARGEST_RATIO))
-        strength = ratio ** (5 / 3) * self._share_of_reach(image, depth, view.focal[1])
+        ratio, share = (
+            expand_batch(value, len(image)) for value in (ratio, self._share_of_reach(image, depth, view.focal[1]))
+        )
         blurred = blur_by_distance(
             light,
-            expand_batch(strength, len(image)),
+            ratio ** (5 / 3) * share,
             view,
             distances=self._constant_distances(id(self), height, width),
             halo=halo_px(largest, view),

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import shareable
-from torchrefract._validation import check_number, check_positive, warn
+from torchrefract._validation import check_number, check_positive, check_tensor, warn
 from torchrefract.fields.depth import GroundPlaneDepth
 from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
@@ -77,9 +77,14 @@ class CorridorDepth:
     def __call__(self, image: Tensor) -> Tensor:
         """Return the depth of images (B, C, H, W) in [0, 1], (B, 1, H, W), m.
 
+        Raises:
+            ValueError, TypeError: images of another shape, or no tensor.
+
         Warns:
             UserWarning: once for each place in the code, that the depth is assumed.
         """
+        if check_tensor("image", image).ndim != 4:
+            raise ValueError(f"image must have shape (B, C, H, W), got {tuple(image.shape)}")
         if not torch.compiler.is_compiling():
             warn(
                 "depth is that of a road between walls; pass depth=, a map in m or torchrefract.depth."

@@ -16,7 +16,10 @@ VEHICLES = (
     *("car", "truck", "bus", "van", "motorcycle", "motorbike", "pickup", "tractor", "trailer", "caravan", "vehicle"),
     *("autorickshaw", "rickshaw", "lorry", "minibus", "suv", "jeep"),
 )
-_CLASS_NAMES = ("labels", "label", "class", "classes", "categories", "category", "category_id", "names")
+_CLASS_NAMES = (
+    *("labels", "label", "class", "classes", "categories", "category", "category_id", "category_ids", "names"),
+    *("class_id", "class_ids", "class_labels", "cls", "gt_labels", "gt_classes"),
+)
 
 
 class LabeledBoxes(NamedTuple):
@@ -26,17 +29,24 @@ class LabeledBoxes(NamedTuple):
     labels: Sequence[int | str] | None  # of each box; None if the boxes have no classes
 
 
-def boxes_of_target(target: Any) -> LabeledBoxes:
+def boxes_of_target(target: Any, *, size: Sequence[int]) -> LabeledBoxes:
     """Return the `BoundingBoxes` of torchvision in a nested target, with the classes that stand beside them.
 
     The classes of boxes are the entry "labels", "classes" or the like of the same dict, or the first entry of the same
     list or tuple with one whole number or text for each box.
+
+    Raises:
+        ValueError: boxes of another canvas than an image of this size, (H, W).
     """
     pairs, _ = pytree.tree_flatten_with_path(target, is_leaf=lambda node: _classes(node) is not None)
     boxes, labels, is_labeled = list[Tensor](), list[int | str](), True
     for path, leaf in pairs:
         if not is_tv_tensor(leaf, "BoundingBoxes") or leaf.numel() == 0:
             continue
+        if tuple(leaf.canvas_size) != tuple(size):
+            raise ValueError(
+                f"BoundingBoxes must have the canvas size of the image, {tuple(size)}, got {tuple(leaf.canvas_size)}"
+            )
         boxes.append(_corners(leaf))
         nearby = [(other, _classes(value)) for other, value in pairs if other[:-1] == path[:-1] and value is not leaf]
         if path and isinstance(path[-1], pytree.MappingKey):

@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,14 @@ from torchrefract.data.images import fit
 from torchrefract.data.module import frames as frame_data
 from torchrefract.data.module import make_pair, pairs
 from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.files import count_out_of_range, decode_flow, encode_flow
+from torchrefract.data.pairs.files import (
+    PairArrays,
+    count_out_of_range,
+    decode_flow,
+    decode_pair,
+    encode_flow,
+    encode_pair,
+)
 from torchrefract.restoration.tasks import Undistort
 
 SIZE = (32, 48)
@@ -160,3 +169,16 @@ def test_pixels_of_a_flow_beyond_512_px_are_marked_as_invalid():
     assert mask.tolist() == [[True, True, False, True, False]]
     assert np.abs(decoded - flow)[:, mask].max() <= 1 / 128
     assert count_out_of_range({"flow": flow, "valid": valid}) == {"flow": 2}
+
+
+@pytest.mark.quick
+def test_pixels_that_the_png_of_a_flow_clips_are_not_valid_in_a_pair():
+    flow, image = np.zeros((2, 1, 3), np.float32), np.zeros((1, 3, 3), np.uint8)
+    flow[0, 0] = [0, 511, 600]
+    valid = np.array([[False, True, True]])
+    maps = {"flow": flow, "valid": valid, "restore_flow": flow, "restore_valid": valid}
+    for form, expected in (("png", [False, True, False]), ("npz", [False, True, True])):
+        files = encode_pair(PairArrays(image, image, maps), form)
+        decoded = decode_pair({name: partial(bytes, data) for name, data in files.items()}).maps
+        for name in ("valid", "restore_valid"):
+            assert decoded[name][0].tolist() == expected

@@ -98,7 +98,7 @@ def decode_pair(
 
     Args:
         files: a function that reads the content of each file, by the suffix of its name.
-        names: maps to decode; None for all.
+        names: maps to decode; None for all. A mask excludes what the PNG of its flow clips.
         size: (height, width) of all images and maps, px; None for that of the clean image.
 
     Raises:
@@ -106,12 +106,17 @@ def decode_pair(
     """
     size = size or _png_size(files["clean.png"]())
     maps: dict[str, np.ndarray] = {}
+    in_range: dict[str, np.ndarray] = {}
     for suffix, read in files.items():
         name, _, file_format = suffix.partition(".")
         if name == _MAPS_STEM:
             maps |= _decode(suffix, read(), partial(_decode_maps, size, file_format, names))
+        elif name in FLOWS and (names is None or name in names):
+            maps[name], in_range[FLOWS[name]] = _decode(suffix, read(), partial(decode_flow, size=size))
         elif name not in IMAGES and (names is None or name in names):
             maps[name] = _decode(suffix, read(), partial(_decode_map, name, size))
+    # The PNG of a flow clips what exceeds its range, and marks it alone: the PNG of the mask does not know.
+    maps |= {name: maps[name] & in_range[name] for name in in_range.keys() & maps.keys()}
     clean, corrupted = (_decode(f"{name}.png", files[f"{name}.png"](), partial(_decode_image, size)) for name in IMAGES)
     return PairArrays(clean, corrupted, maps)
 
@@ -170,8 +175,6 @@ def _encode_map(name: str, value: np.ndarray, maps: Mapping[str, np.ndarray]) ->
 
 
 def _decode_map(name: str, size: tuple[int, int], data: bytes) -> np.ndarray:
-    if name in FLOWS:
-        return decode_flow(data, size)[0]
     if name in MASKS:
         return _decode_png(data, np.uint8, 1, size) > 0
     if name == DEPTH:

@@ -269,6 +269,7 @@ def test_the_learning_rate_finder_of_lightning_trains_before_a_training(trainer,
     finder = LearningRateFinder(num_training_steps=3, early_stop_threshold=None, update_attr=False)
     model = Restoration(Constant, Undistort())
     trainer(max_epochs=2, callbacks=[finder], plugins=[]).fit(model, loader(training))
+    assert finder.optimal_lr is not None
     assert len(finder.optimal_lr.results["loss"]) == 3
 
 

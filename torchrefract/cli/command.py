@@ -344,10 +344,9 @@ def _user_message(error: Exception, name: str) -> str | None:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if str(error).startswith("Config group override must be"):  # a ValueError of Hydra
-        words = (_NO_NAME.fullmatch(word) for word in sys.argv[1:])
-        group, value = next(word.groups() for word in words if word and Path(CONFIG_DIR, word[1]).is_dir())
-        choices = sorted(path.stem for path in Path(CONFIG_DIR, group).glob("*.yaml"))
-        return f"{group} must be one of {', '.join(choices)}, got {value}"
+        for group, value in (word.groups() for word in map(_NO_NAME.fullmatch, sys.argv[1:]) if word):
+            if choices := sorted(path.stem for path in Path(CONFIG_DIR, group).glob("*.yaml")):
+                return f"{group} must be one of {', '.join(choices)}, got {value}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"
     if isinstance(error, FILE_ERRORS) or str(error).startswith("Caught UsageError in DataLoader worker"):

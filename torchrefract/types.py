@@ -156,7 +156,9 @@ class Degraded:
             "valid": _from_result(valid),
             "flow": _from_result(flow),
             "restore_flow": restore,
-            "restore_valid": restore_valid and (lambda d: restore_valid(d, d._read("restore_flow").valid)),
+            "restore_valid": None
+            if restore_valid is None
+            else lambda d: restore_valid(d, d._read("restore_flow").valid),
             "restore_residual": residual,
             "folding": folding,
             **dict.fromkeys(_LIGHT),

@@ -348,7 +348,7 @@ class HeterogeneousFog(PhotometricEffect):
         plan = self.plan_for(image, params, depth)
         distance = self.medium.distance(image, depth)
         k = mean = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
-        if plan.octaves != ():
+        if plan.octaves is None or len(plan.octaves) > 0:
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
             k = self._extinction(expand_batch(k, rows), params, distance, image, plan)

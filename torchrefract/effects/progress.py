@@ -159,7 +159,8 @@ class Progress:
     def result(self, params: Any) -> Degraded:
         """Return the images with all maps."""
         size, device = self.image.shape, self.image.device
-        valid = self.valid or (lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device))
+        everywhere = lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device)  # noqa: E731 - used once
+        valid = everywhere if self.valid is None else self.valid
         if not self.has_warps:
             return Degraded(self.image, params, valid=valid, light=self.light)
         return warped(

@@ -11,6 +11,9 @@ from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.warp import sample_image
 
+# Types of the same bits, as torch.gather, and before PyTorch 2.15 torch.where, take no unsigned ones but uint8.
+_SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
+
 
 def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False) -> Tensor:
     """Warp a segmentation mask along a backward flow: each pixel takes the class of the nearest input pixel.
@@ -38,7 +41,8 @@ def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False
     _check_map("mask", mask, flow)
     _check_fill(fill, mask.dtype)
     warped, in_frame = _warp_map(mask, flow, "bilinear" if soft else "nearest")
-    return torch.where(in_frame, warped, torch.full_like(warped, fill))
+    bits = _SIGNED.get(mask.dtype, mask.dtype)
+    return torch.where(in_frame, warped.view(bits), torch.full_like(warped, fill).view(bits)).view(mask.dtype)
 
 
 def warp_depth(
@@ -167,7 +171,7 @@ def _nearest_integers(value: Tensor, flow: Tensor) -> Tensor:
     index = torch.arange(height * width, dtype=torch.float64, device=value.device).view(1, 1, height, width)
     index = index.expand(flow.shape[0], -1, -1, -1)
     index = sample_image(index, flow, padding="border", interpolation="nearest").long().flatten(2)
-    bits = value.view(torch.int32 if value.dtype.itemsize == 4 else torch.int64)  # gather supports no unsigned types
+    bits = value.view(_SIGNED.get(value.dtype, value.dtype))
     return bits.flatten(2).gather(2, index.expand(-1, value.shape[1], -1)).view(value.shape).view(value.dtype)
 
 

@@ -41,8 +41,10 @@ def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False
     _check_map("mask", mask, flow)
     _check_fill(fill, mask.dtype)
     warped, in_frame = _warp_map(mask, flow, "bilinear" if soft else "nearest")
-    bits = _SIGNED.get(mask.dtype, mask.dtype)
-    return torch.where(in_frame, warped.view(bits), torch.full_like(warped, fill).view(bits)).view(mask.dtype)
+    outside = torch.full_like(warped, fill)
+    if mask.dtype in _SIGNED:
+        return torch.where(in_frame, _bits(warped), _bits(outside)).view(mask.dtype)
+    return torch.where(in_frame, warped, outside)
 
 
 def warp_depth(
@@ -171,8 +173,12 @@ def _nearest_integers(value: Tensor, flow: Tensor) -> Tensor:
     index = torch.arange(height * width, dtype=torch.float64, device=value.device).view(1, 1, height, width)
     index = index.expand(flow.shape[0], -1, -1, -1)
     index = sample_image(index, flow, padding="border", interpolation="nearest").long().flatten(2)
-    bits = value.view(_SIGNED.get(value.dtype, value.dtype))
-    return bits.flatten(2).gather(2, index.expand(-1, value.shape[1], -1)).view(value.shape).view(value.dtype)
+    chosen = _bits(value).flatten(2).gather(2, index.expand(-1, value.shape[1], -1))
+    return chosen.view(value.shape).view(value.dtype)
+
+
+def _bits(value: Tensor) -> Tensor:
+    return value.view(_SIGNED.get(value.dtype, value.dtype))
 
 
 def _check_map(name: str, value: Tensor, flow: Tensor, *, flow_name: str = "flow") -> None:

@@ -251,15 +251,19 @@ def test_bilinear_gradients_are_those_of_finite_differences(padding):
     assert torch.autograd.gradcheck(lambda i, f: warp(i, f, padding=padding)[0], [image, flow.requires_grad_()])
 
 
-def test_bicubic_gradients_are_those_of_finite_differences():
-    image = (0.5 + 0.1 * noise(1, 1, 7, 8)).index_put((torch.tensor(0),) * 4, torch.tensor(9.0).double())
-    flow = torch.full((1, 2, 7, 8), 0.37, dtype=torch.float64)
-    flow[..., :4, :4] += 2  # away from the pixel that sets the range, so that no value is clamped
+@pytest.mark.parametrize("padding", ["zeros", "border", "reflection"])
+def test_bicubic_gradients_are_those_of_finite_differences_also_where_values_are_clamped(padding):
+    image = noise(1, 2, 7, 8)
+    image = 0.9 * image.round() + 0.1 * image  # two levels overshoot
+    flow = (torch.randint(-2, 3, (1, 2, 7, 8), generator=torch.Generator().manual_seed(3)) + 0.37).double()
+    sampled = warp(image, flow, padding=padding, interpolation="bicubic")[0]
+    is_clamped = sampled == image.amax(dim=(2, 3), keepdim=True)
+    assert is_clamped.any()
 
-    def interior(image: Tensor, flow: Tensor) -> Tensor:
-        return warp(image - 9, flow, interpolation="bicubic")[0][..., :3, :4]
+    def warped(image: Tensor, flow: Tensor) -> Tensor:
+        return warp(image, flow, padding=padding, interpolation="bicubic")[0]
 
-    assert torch.autograd.gradcheck(interior, [image.requires_grad_(), flow.requires_grad_()])
+    assert torch.autograd.gradcheck(warped, [image.requires_grad_(), flow.requires_grad_()])
 
 
 @pytest.mark.parametrize(

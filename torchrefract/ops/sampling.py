@@ -260,7 +260,7 @@ def _finite(values: Tensor, limit: float) -> Tensor:
 
 def _clamp_to_range(sampled: Tensor, source: Tensor, padding: str) -> Tensor:
     # As bounds, pixels that are not finite would spread over the image.
-    is_finite, source = source.isfinite(), source.detach()
+    is_finite = source.isfinite()
     low = torch.where(is_finite, source, torch.inf).amin(dim=(2, 3), keepdim=True)
     high = torch.where(is_finite, source, -torch.inf).amax(dim=(2, 3), keepdim=True)
     if padding == "zeros":

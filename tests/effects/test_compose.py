@@ -306,6 +306,16 @@ def test_gradients_reach_every_effect_and_the_image():
     assert torch.autograd.gradcheck(degrade, [value.clone().requires_grad_() for value in inputs], fast_mode=True)
 
 
+def test_an_empty_batch_stays_empty_also_where_gradients_are_needed():
+    effect, image = Compose([Turbulence(), LensDistortion(**LENS)]), torch.zeros(0, 3, 8, 9)
+    params = effect.sample(image, seed=7)
+    first, second = params.children
+    first = first._replace(amplitude=first.amplitude.clone().requires_grad_())
+    second = second._replace(coefficients=second.coefficients.clone().requires_grad_())
+    for name, value in maps_of(effect.apply(image, params._replace(children=(first, second)))).items():
+        assert (value.shape[0], *value.shape[2:]) == (0, 8, 9), name
+
+
 def test_one_graph_draws_and_degrades_as_eager_mode():
     choice = OneOf([LensFlare(p=0.7), ThinPlateSpline()])
     effect = Compose([ThinPlateSpline(padding="border", p=0.7), UniformFog(p=0.7), choice])

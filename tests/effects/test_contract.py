@@ -467,6 +467,14 @@ def test_an_empty_batch_stays_empty(case):
         assert (value.shape[0], *value.shape[2:]) == (0, 8, 9), name
 
 
+def test_an_empty_batch_stays_empty_also_where_gradients_are_needed(case):
+    effect, image = case.strong(), torch.zeros(0, 3, 8, 9, requires_grad=True)
+    params = effect.sample(image, seed=7)
+    field = getattr(params, case.fields[0]).clone().requires_grad_()
+    for name, value in maps_of(effect.apply(image, params._replace(**{case.fields[0]: field}))).items():
+        assert (value.shape[0], *value.shape[2:]) == (0, 8, 9), name
+
+
 @pytest.mark.parametrize(
     ("value", "interpolation"), [(math.nan, "bilinear"), (math.inf, "bicubic"), (-math.inf, "bilinear")]
 )

@@ -291,6 +291,8 @@ class Effect(nn.Module, ABC):
 
     def may_change(self, params: Any) -> bool:
         """Return False if no sample changes; True if one does, if that cannot be read, or if gradients are needed."""
+        if len(params.applied) == 0:  # Fourier transforms and minima have no empty batch
+            return False
         active = params.applied & ~params.is_identity
         return eager_values(active.any, of=active) is not False or requires_grad(params)
 

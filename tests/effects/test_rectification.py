@@ -129,9 +129,11 @@ def test_one_sampling_with_a_lens_keeps_more_than_two():
     assert once > both + 2, (once, both)
 
 
-@pytest.mark.parametrize(("name", "tolerance_px"), [("opencv14", None), ("fisheye", 0.05)])
-def test_one_graph_gives_the_same_as_eager_mode(name, tolerance_px):
-    effect, image = Rectification(ALL[name], tolerance_px=tolerance_px), smooth(2, 3, 27, 48)
+@pytest.mark.parametrize(
+    ("name", "tolerance_px", "frame"), [("opencv14", None, "pad"), ("fisheye", 0.05, "pad"), ("opencv5", 0.05, "crop")]
+)
+def test_one_graph_gives_the_same_as_eager_mode(name, tolerance_px, frame):
+    effect, image = Rectification(ALL[name], tolerance_px=tolerance_px, frame=frame), smooth(2, 3, 27, 48)
     assert (effect.plan(27, 48).stride > 1) == (tolerance_px is not None)
     compiled = torch.compile(effect, fullgraph=True, backend="eager")
     assert_close(compiled(image), effect(image), rtol=0, atol=2e-4)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_within, eager_values, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.batch import check_shapes, params_to
@@ -175,14 +175,16 @@ class Rectification(WarpEffect):
 
     def clean_camera(self, height: int, width: int) -> Camera:
         """Return the pinhole of the rectified frames of a size."""
-        camera = self.camera.resized(width=width, height=height)
-        zoom = zoom_to_crop(camera) if self.frame == "crop" else 1.0
+        camera, zoom = self.camera.resized(width=width, height=height), self._constant_zoom(id(self), height, width)
         return replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
 
     def _zoom(self, params: RectificationParams, height: int, width: int) -> Tensor:
-        is_cropped = self.frame == "crop"
-        zoom = zoom_to_crop(self.camera.resized(width=width, height=height)) if is_cropped else 1.0
-        return torch.full_like(params.focal[:, 0], zoom)
+        return torch.full_like(params.focal[:, 0], self._constant_zoom(id(self), height, width))
+
+    # torch.compile takes the zoom as a constant, see `WarpEffect`.
+    @assume_constant_result
+    def _constant_zoom(self, _: int, height: int, width: int) -> float:
+        return zoom_to_crop(self.camera.resized(width=width, height=height)) if self.frame == "crop" else 1.0
 
     def _numbers(self) -> tuple[tuple[float, ...], ...]:
         """Return the coefficients, and in widths the focal lengths and the offset of the principal point."""

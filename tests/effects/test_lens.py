@@ -145,6 +145,23 @@ def test_strong_pincushions_converge_everywhere(k1):
     assert degraded.valid.all()
 
 
+@pytest.mark.filterwarnings("ignore:.*must not fold back inside the frame:UserWarning")
+def test_the_residual_of_pixels_without_an_inverse_is_finite():
+    none = (0.0, 0.0)
+    lens = LensDistortion(
+        k1_range=(-0.3, -0.3),
+        k2_range=none,
+        k6_range=(0.1, 0.1),
+        p1_range=none,
+        p2_range=none,
+        focal_range=(0.1, 0.1),
+        frame="pad",
+    )
+    degraded = lens.degrade(torch.zeros(1, 1, 60, 1), seed=0)
+    assert degraded.restore_flow.abs().max() > 1e20  # its square is no number of float32
+    assert degraded.restore_residual.isfinite().all()
+
+
 @pytest.mark.parametrize(("padding", "outside"), [("zeros", 0.0), ("border", 1.0), ("reflection", 1.0)])
 def test_padding_fills_pixels_that_show_points_outside_the_frame(padding, outside):
     # The corners of a barrel distortion show points outside the clean frame.

@@ -63,5 +63,4 @@ def inside(flow: Tensor) -> Tensor:
 
 def length(flow: Tensor) -> Tensor:
     """Return sqrt(u^2 + v^2), px, of a flow (B, 2, H, W), as (B, 1, H, W) without gradient."""
-    u, v = flow.detach().split(1, dim=1)
-    return torch.addcmul(u * u, v, v).sqrt_()
+    return torch.hypot(*flow.detach().split(1, dim=1))  # squares of invalid flows overflow

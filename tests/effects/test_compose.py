@@ -23,6 +23,7 @@ from torchrefract import (
 )
 from torchrefract.effects.base import Effect
 from torchrefract.effects.warp_effect import WarpEffect
+from torchrefract.warping.grid import inside
 from torchrefract.warping.lattice import pixel_lattice
 
 LENS: dict[str, Any] = {"k1_range": (-0.3, -0.2), "k2_range": (0.1, 0.2)}
@@ -304,6 +305,14 @@ def test_gradients_reach_every_effect_and_the_image():
 
     inputs = (image, spline.displacement, fog.visibility, lens.coefficients)
     assert torch.autograd.gradcheck(degrade, [value.clone().requires_grad_() for value in inputs], fast_mode=True)
+
+
+def test_valid_pixels_of_a_composition_lead_into_the_frame():
+    effect = Compose([RollingShutter(speed_range=(150, 150), readout_range=(30, 30)), LensDistortion()])
+    near = random_image(1, 1, 24, 32, seed=8) < 0.3  # the cubics between pixels overshoot at edges of depth
+    degraded = effect.degrade(random_image(1, 3, 24, 32), seed=8, depth=torch.where(near, 3.0, 100.0))
+    assert degraded.valid.double().mean() > 0.8
+    assert (degraded.valid <= inside(degraded.flow)).all()
 
 
 def test_an_empty_batch_stays_empty_also_where_gradients_are_needed():

@@ -119,6 +119,8 @@ class Progress:
             flow = _remember(partial(leaf.effect.planned_flow, leaf.params, height, width, share_px))
             self.warps.append((leaf.effect, leaf.params, flow, moves))
             self.valid = _valid_after(self.valid, flow, moves)
+        if len(leaves) > 1:  # cubics between pixels may lead out of the frame though all pixels around lead into it
+            self.valid = _combined(torch.logical_and, self.valid, lambda: inside(segment.flow.dense))
         self.segments.append(segment)
 
     def depth_for(self, effect: Effect) -> Tensor | None:

@@ -32,9 +32,11 @@ class CorridorDepth:
     road itself: `end` is `far`, or min(`far`, `closed`) there. Pass it as `depth=` to a fog; a depth map, or a network
     (`torchrefract.depth.from_transformers`), is better.
 
+    Numbers out of range raise ValueError.
+
     camera_height, focal, horizon, spread: of the road, as for `GroundPlaneDepth`.
-    side: m, w, from the camera to each wall.
-    vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge.
+    side: m, w, from the camera to each wall, above 0.
+    vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge, in [-10, 10].
     height: m, h, of what stands beside the road, above `camera_height`.
     far: m, the largest depth outside of the sky.
     closed: m, the largest depth of a frame by day that shows no sky.

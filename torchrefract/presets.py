@@ -1,7 +1,8 @@
 """Scenes: effects with the parameters of a place, as a function of severity.
 
 `severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
-physical quantity, which each scene states, so that the score of a model can be plotted over it.
+physical quantity, which each scene states, so that the score of a model can be plotted over it. Other severities, and
+arguments that the effects of a scene do not take, raise ValueError and TypeError.
 
 All scenes take the same keyword arguments about the frames, so that a loop over scenes can pass them to each:
 

@@ -149,6 +149,9 @@ class Robustness:
         Args:
             scene: one with a quantity.
             loss: share of the mean score of the clean images, in (0, 1).
+
+        Raises:
+            ValueError: a scene without a quantity, a loss out of range, or clean images of the score 0.
         """
         loss = check_number("loss", loss, low=1e-6, high=1 - 1e-6)
         if not self.clean.any():
@@ -168,9 +171,18 @@ class Robustness:
             of: "score" for the mean over the images, "worst_case" for that of their worst cases, or the name of a score
                 of all images together, such as "mAP".
 
+        Raises:
+            ValueError: a scene that was not scored, or a score that the run has not.
+
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
-        scenes = [scene] if scene else list(dict.fromkeys(level.scene for level in self.scores))
+        scenes = list(dict.fromkeys(level.scene for level in self.scores))
+        if scene is not None and scene not in scenes:
+            raise ValueError(f"scene must be one of {', '.join(scenes)}, got {scene}")
+        names = ["score", *(["worst_case"] if self.worst_case else []), *self.set_scores.get(None, ())]
+        if of not in names:
+            raise ValueError(f"of must be one of {', '.join(names)}, got {of}")
+        scenes = scenes if scene is None else [scene]
         means = [np.mean([self._value(of, level) for level in self.scores if level.scene == s]) for s in scenes]
         return float(np.mean(means))
 

@@ -369,16 +369,6 @@ def test_a_run_is_not_continued_after_a_change_of_the_module_of_its_model_or_sco
     assert "out must be a folder of the same settings, got one with files={" in outcome.err
 
 
-def test_a_picture_that_was_replaced_is_scored_again(call, tmp_path, frames):
-    words = (*COMMAND, "labels=coco.json", "scene=cheap_dashcam", "severity=1")
-    assert "clean score 1.000" in call(*words).out
-    cv2.imwrite(str(frames / "1 a=b.png"), np.zeros((72, 128, 3), np.uint8))
-    for _ in range(2):  # the second time from the stored scores
-        assert "4 pictures, clean score 0.750" in call(*words).out
-        rows = [json.loads(line)["name"] for line in (tmp_path / "out/scores.jsonl").read_text().splitlines()[1:]]
-        assert rows == [f"{i} a=b.png" for i in (0, 1, 2, 3, 1)]
-
-
 def test_a_file_that_is_no_picture_is_named_and_skipped(call, tmp_path, frames):
     words = ("scene=cheap_dashcam", "severity=1")
     expected = call(*COMMAND, *words).out

@@ -97,11 +97,6 @@ class _Folder(NamedTuple):
         """Return the camera of all pictures, if it is given."""
         return self.place.get("camera")
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Return the bytes of each picture."""
-        return {name: (self.path / name).stat().st_size for name in self.names}
-
     def depth(self, name: str, image: Tensor) -> Tensor | None:
         """Return the depth map (1, H, W), m, of a picture; None without maps."""
         if self.depths is None:
@@ -157,11 +152,7 @@ def test_robustness(cfg: DictConfig) -> None:
         )
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    with (
-        locked("out", out),
-        stored_scores(out / SCORES, settings, folder.sizes) as (done, store),
-        warnings.catch_warnings(),
-    ):
+    with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))

@@ -36,15 +36,9 @@ REFERENCE_WIDTH = 1920  # px, of frames for which scenes are described; their qu
 
 @contextmanager
 def stored_scores(
-    path: Path, settings: Mapping[str, Any], sizes: Mapping[str, int]
+    path: Path, settings: Mapping[str, Any]
 ) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
-    """Yield the scores of an earlier run, and a function that stores those of a picture.
-
-    Args:
-        path: of the file of scores.
-        settings: of this run.
-        sizes: bytes of each picture; one of another size than at its score is another picture, and has no score.
-    """
+    """Yield the scores of an earlier run, and a function that stores those of a picture."""
     lines = _complete_lines(path)
     if len(lines) == 1:
         lines = []  # of a run that scored nothing
@@ -56,14 +50,13 @@ def stored_scores(
                 f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
             )
         _check_versions(before.get("versions") or {})
-    done = dict(map(parse_scores, (line for line in lines[1:] if _is_of_size(line, sizes))))
+    done = dict(map(parse_scores, lines[1:]))
     write_file(path, "".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", alone=True)
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
             levels = [[*level, of] for level, of in scored.levels.items()]
-            row = {"name": name, "bytes": sizes[name], "clean": scored.clean, "levels": levels}
-            stream.write(json.dumps(row) + "\n")
+            stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
             stream.flush()
 
         yield done, store
@@ -131,12 +124,6 @@ def _complete_lines(path: Path) -> list[str]:
     """Return the lines of a file, without a part of one that a killed run left; none without a file."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
     return [line for line in lines if line.endswith("\n")]
-
-
-def _is_of_size(line: str, sizes: Mapping[str, int]) -> bool:
-    """Return True if a line has the scores of a picture of its size now, or none, as earlier versions wrote."""
-    row = json.loads(line)
-    return row.get("bytes") in (None, sizes.get(row["name"]))
 
 
 def parse_scores(line: str) -> tuple[str, Scored]:

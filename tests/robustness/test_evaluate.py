@@ -320,7 +320,7 @@ def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(val
 
 def test_unknown_scenes_raise():
     result = evaluate(lambda x: [x], black(2), {"fog": {1: UniformFog()}}, lambda *_: 1.0)
-    with pytest.raises(ValueError, match="scene must be one with a quantity: , got fog"):
+    with pytest.raises(ValueError, match=r"scene must be one with a quantity \(no scene has one\), got fog"):
         result.tolerated("fog")
 
 

@@ -157,7 +157,9 @@ class Robustness:
         if not self.clean.any():
             raise ValueError("the mean score of the clean images must be above 0, got 0: check labels and classes")
         if scene not in self.quantities:
-            raise ValueError(f"scene must be one with a quantity: {', '.join(self.quantities)}, got {scene}")
+            raise ValueError(
+                f"scene must be one with a quantity ({', '.join(self.quantities) or 'no scene has one'}), got {scene}"
+            )
         levels = [level for level in self.scores if level.scene == scene]
         values, scores = (np.stack([by[level] for level in levels]) for by in (self.values, self.scores))
         least, is_harm = (1 - loss) * float(self.clean.mean()), self.quantities[scene].is_harm

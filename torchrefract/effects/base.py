@@ -293,10 +293,8 @@ class Effect(nn.Module, ABC):
 
     def may_change(self, params: Any) -> bool:
         """Return False if no sample changes; True if one does, if that cannot be read, or if gradients are needed."""
-        if len(params.applied) == 0:  # Fourier transforms and minima have no empty batch
-            return False
         active = params.applied & ~params.is_identity
-        return eager_values(active.any, of=active) is not False or requires_grad(params)
+        return len(active) > 0 and (eager_values(active.any, of=active) is not False or requires_grad(params))
 
     def check_params(self, params: Any, image: Tensor) -> None:
         """Raise unless these are valid parameters of this effect for images (B, C, H, W).

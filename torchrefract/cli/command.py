@@ -91,6 +91,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     def job(cfg: DictConfig) -> None:
         with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
             function(cfg)
+            sys.stdout.flush()
 
     job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
@@ -312,6 +313,11 @@ def _one_line_errors(name: str) -> Iterator[None]:
     """Print an error that the user can fix as one line and end the program; raise any other again."""
     try:
         yield
+    except BrokenPipeError:  # as for `| head`
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), sys.stdout.fileno())  # Python flushes the output when it exits
+        print("stopped, as the reader of the output has ended; the same command continues", file=sys.stderr)
+        raise SystemExit(1) from None
     except Exception as error:  # all but the known ones are raised again
         is_missing = isinstance(error, ModuleNotFoundError)
         if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:

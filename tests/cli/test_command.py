@@ -78,6 +78,10 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
         (FileExistsError(errno.EEXIST, "File exists", "a.yaml"), "a.yaml could not be written: File exists"),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b could not be written: Not a directory"),
         (PermissionError(errno.EACCES, "Permission denied", "frames"), "frames could not be opened: Permission denied"),
+        (
+            RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "),
+            "data.workers must fit the memory, got one that ended (DataLoader worker (pid 7) is killed by signal: Kill",
+        ),
     ):
         with pytest.raises(SystemExit) as stop:
             run_main(lambda error=error: fail(error))

@@ -360,7 +360,15 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))
         return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split())
-    return _file_message(error) if isinstance(error, OSError) else None
+    return _file_message(error) if isinstance(error, OSError) else _worker_message(error)
+
+
+def _worker_message(error: Exception) -> str | None:
+    """Return one line for the error that PyTorch raises if a worker of a DataLoader was killed, None for any other."""
+    reason = str(error).strip().rstrip(".")
+    if not reason.startswith("DataLoader worker (pid"):
+        return None
+    return f"data.workers must fit the memory, got one that ended ({reason}); a training continues by ckpt_path="
 
 
 def _file_message(error: OSError) -> str | None:

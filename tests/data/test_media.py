@@ -255,6 +255,22 @@ def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
             assert container.streams.video[0].sample_aspect_ratio == ratio
 
 
+def test_a_title_that_is_not_unicode_is_read_over(tmp_path):
+    with media_file(tmp_path / "a.avi", "w") as container:
+        stream = container.add_stream("mjpeg", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "yuvj420p"
+        container.metadata["title"] = "Strasse"
+        frame = av.VideoFrame.from_ndarray(page(), format="rgb24")
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    content = (tmp_path / "a.avi").read_bytes()
+    assert b"Strasse" in content
+    (tmp_path / "a.avi").write_bytes(content.replace(b"Strasse", b"Stra\xdfe."))
+    ((number, frame),) = read_video(tmp_path / "a.avi", [0])
+    assert number == 0
+    assert np.abs(frame[0].permute(1, 2, 0).numpy() * 255 - page()).mean() < 2
+
+
 @pytest.mark.parametrize("angle", [10, 45, -80, 170])
 def test_a_video_that_is_turned_by_an_odd_angle_raises(tmp_path, angle):
     c, s = (round(ONE * f(np.deg2rad(angle))) for f in (np.cos, np.sin))

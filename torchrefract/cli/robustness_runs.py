@@ -60,7 +60,7 @@ def stored_scores(
 
         def store(name: str, scored: Scored) -> None:
             levels = [[*level, of] for level, of in scored.levels.items()]
-            row = {"name": name, "clean": scored.clean, "levels": levels, "file": _stamp(data / name)}
+            row = {"name": name, "clean": scored.clean, "levels": levels, "date": _date_of(data / name)}
             stream.write(json.dumps(row) + "\n")
             stream.flush()
 
@@ -125,14 +125,14 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     return paths | {"scene": scenes, "severity": severities} | {name: settings.get(name) for name in _SHARED}
 
 
-def _stamp(path: Path) -> list[int] | None:
-    """Return the size and the time of the last change of a file; None if it does not exist."""
-    return [path.stat().st_size, path.stat().st_mtime_ns] if path.is_file() else None
+def _date_of(path: Path) -> int | None:
+    """Return the time of the last change of a file, ns; None if it does not exist."""
+    return path.stat().st_mtime_ns if path.is_file() else None
 
 
 def _is_current(row: Mapping[str, Any], data: Path) -> bool:
-    """Return True if a picture is the one that was scored; earlier versions stored no stamp."""
-    return row.get("file") in (None, _stamp(data / row["name"]))
+    """Return True if a picture is the one that was scored; earlier versions stored no date."""
+    return row.get("date") in (None, _date_of(data / row["name"]))
 
 
 def _complete_lines(path: Path) -> list[str]:

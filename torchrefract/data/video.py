@@ -38,6 +38,8 @@ _COLOR_MATRICES = {int(space) for space in Colorspace}  # those that can be conv
 _HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273
 _UPRIGHT = np.eye(3, dtype=np.int32)
 _MAX_SKEW = 0.01  # of a display matrix, which is rounded
+# Before version 19, PyAV raises for a title that is not UTF-8.
+_ANY_METADATA: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 
 
 def read_video(path: Path, times: Iterable[int], *, upright: bool = True) -> Iterator[tuple[int, Tensor]]:
@@ -201,7 +203,7 @@ def _open(path: Path) -> av.VideoStream | None:
     try:
         # FFmpeg takes the part of a relative path before a colon for a protocol.
         source = path.open("rb") if is_remote(path) else str(path.resolve())
-        container = av.open(cast(Any, source), metadata_errors="replace")
+        container = av.open(cast(Any, source), **_ANY_METADATA)
     except av.FFmpegError:
         return None
     if isinstance(video := container.streams.best("video"), av.VideoStream) and _has_codec(video):

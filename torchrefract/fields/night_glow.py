@@ -25,8 +25,6 @@ def lamp_light(image: Tensor, threshold: float) -> Tensor:
 
         mean over a block of max(I - threshold, 0)^2 / (1 - threshold)^2, at most 1
 
-    In blocks of an even side every second row counts.
-
     Args:
         image: (N, C, H, W), stored values, I; NaN and infinite ones count as black.
         threshold: in [0, 1), from which a value counts as that of a lamp.
@@ -35,11 +33,10 @@ def lamp_light(image: Tensor, threshold: float) -> Tensor:
         (N, C, h, w), at the centers of blocks of one side, so that the longer side of a frame has at most 320.
     """
     stride = lattice_stride(image)
-    step = 2 if stride % 2 == 0 else 1  # lamps of frames that large are several pixels high
 
     def of_rows(band: Tensor) -> Tensor:
-        excess = (band[:, :, ::step] - threshold).relu_().square()
-        return F.avg_pool2d(excess, (stride // step, stride), ceil_mode=True, count_include_pad=False)
+        excess = (band - threshold).relu_().square()
+        return F.avg_pool2d(excess, stride, ceil_mode=True, count_include_pad=False)
 
     if len(image) == 0:
         return image[:, :, ::stride, ::stride]

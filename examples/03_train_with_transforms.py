@@ -18,7 +18,7 @@ SIZE = (180, 320)
 
 
 class Scenes(Dataset):
-    """Rendered roads with the box of the road ahead."""
+    """Rendered roads with a magenta sign and its box."""
 
     def __init__(self, transform: v2.Transform):
         self.frames, self.transform = RoadScenes(8, size=SIZE), transform
@@ -27,10 +27,12 @@ class Scenes(Dataset):
         return len(self.frames)
 
     def __getitem__(self, i: int) -> tuple[torch.Tensor, dict]:
-        box = torch.tensor([[110.0, 70.0, 210.0, 130.0]])
+        image = self.frames[i].image
+        image[:, 50:80, 210:260] = torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+        box = torch.tensor([[210.0, 50.0, 260.0, 80.0]])
         boxes = tv_tensors.BoundingBoxes(box, format="XYXY", canvas_size=SIZE)  # pyright: ignore[reportCallIssue]  # torchvision's overloads
         target = {"boxes": boxes, "labels": torch.tensor([1])}
-        return self.transform(tv_tensors.Image(self.frames[i].image), target)
+        return self.transform(tv_tensors.Image(image), target)
 
 
 def main() -> None:

@@ -44,6 +44,7 @@ class FindSign(pl.LightningModule):
         return torch.optim.AdamW(self.parameters(), lr=1e-3)
 
 
+torch.manual_seed(0)
 frames = render_road_scenes(torch.arange(16), *SIZE)[0]
 signs = torch.tensor([[20, 12, 80, 52], [180, 20, 240, 60], [40, 100, 100, 150], [180, 95, 260, 150]] * 4)[:, None]
 for frame, (x1, y1, x2, y2) in zip(frames, signs[:, 0], strict=True):

@@ -329,3 +329,10 @@ def test_the_key_of_a_name_is_its_blake2b_digest_on_every_machine(name, digest):
     assert key_of(PurePosixPath(name)) == (digest >> 1 if name else key_of("."))
     assert key_of(PureWindowsPath("drive", "0001.jpg")) == key_of("drive/0001.jpg")
     assert random.uniform(random.stream(0, torch.tensor([key_of(name)])), 1).shape == (1, 1)
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("name", [7, None])
+def test_what_is_no_name_has_no_key(name):
+    with pytest.raises(TypeError, match="name must be a text or a path, got"):
+        key_of(name)

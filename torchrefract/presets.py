@@ -1,7 +1,8 @@
 """Scenes: effects with the parameters of a place, as a function of severity.
 
 `severity` is 1 (barely visible), 2, 3 (typical of the place), 4 or 5 (barely anything else is visible). It sets a
-physical quantity, which each scene states, so that the score of a model can be plotted over it.
+physical quantity, which each scene states, so that the score of a model can be plotted over it. Other severities, and
+arguments that the effects of a scene do not take, raise ValueError and TypeError.
 
 All scenes take the same keyword arguments about the frames, so that a loop over scenes can pass them to each:
 
@@ -186,7 +187,7 @@ def highveld_heat_haze(
     Args:
         severity: 1 to 5, temperature of the air at the road above that at the camera of 5, 10, 15, 20, 30 K, and
             standard deviation of the displacement 200 m away of 0.5, 1.0, 1.5, 2.2, 3.0 px, each +-20 %, which is that
-            of a Cn2 of 8e-11, 3e-10, 7e-10, 1.5e-9, 2.8e-9 m^(-2/3): 80 to 2800 times a hot day.
+            of a Cn2 of 7.6e-11, 3e-10, 6.8e-10, 1.5e-9, 2.7e-9 m^(-2/3): 76 to 2700 times a hot day.
         camera, horizon, depth, width: as for all scenes.
         mirage: arguments of `RoadMirage`.
         arguments: of `Turbulence`.

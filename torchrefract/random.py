@@ -64,8 +64,13 @@ def key_of(name: str | PurePath) -> int:
     Returns:
         An integer in [0, 2^63): the highest 63 bits of the BLAKE2b digest of 8 bytes.
 
+    Raises:
+        TypeError: a name that is neither a text nor a path, as the number of a sample, which is a key already.
+
     Source: Saarinen and Aumasson, "The BLAKE2 cryptographic hash and message authentication code", RFC 7693 (2015).
     """
+    if not isinstance(name, str | bytes | os.PathLike):
+        raise TypeError(f"name must be a text or a path, got {type(name).__name__}; an integer is a key already")
     text = name.as_posix() if isinstance(name, PurePath) else name
     return int.from_bytes(hashlib.blake2b(os.fsencode(text), digest_size=8).digest(), "big") >> 1
 

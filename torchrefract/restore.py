@@ -7,7 +7,7 @@ Options:
     input=PATH              a picture, a video, or a folder of them with its subfolders, required
     out=restored            output folder; names and subfolders are those of the input
     size=[720,1280]         [height, width] to which frames are resized for the model; default: that of its training
-    tile=512                px or [height, width]; the model sees tiles of a frame instead of the resized frame
+    tile=512                px or [height, width]; a model of deweather sees tiles in place of the resized frame
     pool=auto               one lens for each video, from a lens model's flows and straight edges, so that the result
                             does not shake; lens: one for all files, of one camera; null: each frame alone
     interpolation=bicubic   of the warp along a predicted flow; or bilinear

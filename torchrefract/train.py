@@ -11,8 +11,8 @@ Options:
     scene=NAME              degradation: cheap_dashcam, cape_town_fog, paper_refractive, paper_weather, ...
     camera=FILE             camera file of the frames, see cameras/README.md; horizon=0.5 of their height, 0 at the top
     model=NAME              network: lens_net (default of undistort), fog_net (of deweather), resunet, ddpm, ...
-    trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=6 sets the length; logger=tensorboard or wandb
-    data.batch_size=16      frames in a step; data.workers=2 processes load them
+    trainer=cpu             hardware: cpu, gpu or ddp; trainer.max_epochs=12 sets the length; logger=tensorboard, wandb
+    data.batch_size=8       frames in a step; data.workers=2 processes load them
     ckpt_path=FILE          last.ckpt of a stopped run, which is resumed; init_from=lens_small, or a checkpoint of the
                             same model, gives the weights to start with
     hydra.run.dir=DIR       run folder; seed=0 sets weights, order and degradations

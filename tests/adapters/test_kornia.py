@@ -91,6 +91,12 @@ def test_frames_of_a_clip_share_a_draw_that_their_labels_follow():
         assert_close(moved[:, t], warp_points(points, degraded.flow)[0], rtol=0, atol=1e-3)
 
 
+@pytest.mark.quick
+def test_what_is_no_effect_raises():
+    with pytest.raises(TypeError, match=r"effect must be an effect of torchrefract, got Identity$"):
+        adapter.KorniaEffect(nn.Identity())  # pyright: ignore[reportArgumentType]  # the test is of this
+
+
 def test_without_kornia_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "kornia.constants", None)
     monkeypatch.delitem(sys.modules, adapter.__name__)

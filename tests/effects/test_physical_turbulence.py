@@ -234,9 +234,9 @@ def test_the_flow_has_the_gradient_of_its_depth():
 def test_cn2_and_displacements_convert_into_each_other():
     camera = Camera(width=1920, height=1080, fx=1400, fy=1400, cx=960, cy=540, coefficients=(0.0,) * 5)
     # Sizes that were computed by quadrature: wide dashcams, and a lens of 25 mm at 2 km.
-    for cn2, distance, px in ((1e-12, 200.0, 0.05), (1e-11, 300.0, 0.19)):
-        effect = Turbulence.from_physics(cn2, camera=camera, outer_scale=1e4)
-        assert effect.equivalent_amplitude(1920, distance=distance)[0] == pytest.approx(px, abs=0.005)
+    for cn2, distance, px in ((1e-12, 200.0, 0.0465), (1e-11, 300.0, 0.1802)):
+        effect = Turbulence.from_physics(cn2, camera=camera)
+        assert effect.equivalent_amplitude(1920, distance=distance)[0] == pytest.approx(px, rel=1e-3)
     long = PhysicalTurbulence(
         cn2_range=(1e-12, 1e-12),
         camera=Camera(width=1920, height=1080, fx=8570, fy=8570, cx=960, cy=540, coefficients=(0.0,) * 5),

@@ -116,14 +116,15 @@ def test_a_cached_constant_does_not_depend_on_who_computes_it_first():
 
 
 def test_a_graph_takes_another_frame_size_and_batch():
-    effect = tr.ThinPlateSpline()
-    compiled = torch.compile(effect, fullgraph=True, backend="eager")
-    for shape in ((2, 3, 24, 32), (3, 3, 20, 28)):
+    effect, graphs = tr.ThinPlateSpline(), []
+    compiled = torch.compile(effect, fullgraph=True, backend=lambda graph, _: graphs.append(graph) or graph.forward)
+    for shape in ((2, 3, 24, 32), (3, 3, 20, 28), (3, 3, 24, 32), (2, 3, 24, 32)):
         image = random_image(*shape)
         torch.manual_seed(3)
         expected = effect(image)
         torch.manual_seed(3)
         assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+    assert len(graphs) == 3
 
 
 def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch():

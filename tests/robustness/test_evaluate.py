@@ -320,5 +320,17 @@ def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(val
 
 def test_unknown_scenes_raise():
     result = evaluate(lambda x: [x], black(2), {"fog": {1: UniformFog()}}, lambda *_: 1.0)
-    with pytest.raises(ValueError, match="scene must be one with a quantity: , got fog"):
+    with pytest.raises(ValueError, match=r"scene must be one with a quantity \(no scene has one\), got fog"):
         result.tolerated("fog")
+
+
+@pytest.mark.quick
+def test_a_mean_of_an_unknown_scene_or_score_raises():
+    result = evaluate(lambda image: image.mean(dim=(1, 2, 3)), black(2), {"fog": fogs()}, lambda *_: 0.5)
+    for of_set in (result.mean_performance, result.relative_performance):
+        assert of_set("fog") == pytest.approx(0.5 if of_set == result.mean_performance else 1)
+        with pytest.raises(ValueError, match="scene must be one of fog, got fgo"):
+            of_set("fgo")
+        for of in ("worst_case", "mAP"):
+            with pytest.raises(ValueError, match=f"of must be one of score, got {of}"):
+                of_set(of=of)

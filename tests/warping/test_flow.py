@@ -122,6 +122,13 @@ def test_gradients_of_the_determinant_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(jacobian_determinant, [flow])
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("valid", [torch.ones(2, 1, 4, 5), torch.ones(4, 5).bool(), torch.ones(2, 1, 3, 5).bool()])
+def test_a_mask_of_another_shape_or_type_than_that_of_the_flow_raises(valid):
+    with pytest.raises(ValueError, match=r"valid must be bool of shape \(2, 1, 4, 5\), as the flow, got "):
+        folding(torch.zeros(2, 2, 4, 5), valid)
+
+
 def test_folding_of_another_shape_raises():
     with pytest.raises(ValueError, match=r"flow must have shape \(B, 2, H, W\)"):
         folding(torch.zeros(2, 4, 5))

@@ -34,10 +34,16 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
         effect: the effect; its own `p` decides which samples it degrades.
         same_on_batch: draw once for all samples of a batch.
         keepdim: see kornia.
+
+    Raises:
+        TypeError: effect is not one of torchrefract; a call in a container that would leave labels behind.
+        ValueError: labels without their image in the same call.
     """
 
     def __init__(self, effect: Effect, *, same_on_batch: bool = False, keepdim: bool = False):
         super().__init__(p=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
+        if not isinstance(effect, Effect):
+            raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
         self.effect = effect
         self._drawn: tuple[Tensor | None, Tensor | None] = None, None  # the seed and flow of the last images
         self.flags = {"resample": Resample.NEAREST}  # of masks; `extra_args` of a container replace it

@@ -207,6 +207,9 @@ class Camera:
         """Return the camera of the same frames mirrored left to right ("horizontal") or top to bottom ("vertical").
 
         cx' = W - 1 - cx, and the coefficients of terms that are odd in x change their sign; likewise cy.
+
+        Raises:
+            ValueError: another direction.
         """
         odd = _ODD[check_choice("direction", direction, DIRECTIONS)]
         pairs = zip(COEFFICIENTS[self.model], self.coefficients, strict=False)

@@ -57,6 +57,9 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
     Args:
         path: to write.
         cameras: by their ids, "fisheye", or "opencv" without prism and tilt.
+
+    Raises:
+        ValueError: a model, or coefficients, that the file cannot hold; see `convert`.
     """
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", f"# Number of cameras: {len(cameras)}"]
     for number, camera in cameras.items():

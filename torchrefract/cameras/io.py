@@ -119,6 +119,9 @@ def read_opencv(path: str | Path) -> Camera:
 
     Args:
         path: of YAML, JSON or XML.
+
+    Raises:
+        ValueError: a file of another form, or a camera that no model here computes exactly.
     """
     return _plain_camera(Path(path), _storage(Path(path)))
 
@@ -151,6 +154,9 @@ def write_opencv(path: str | Path, camera: Camera, *, covariance: np.ndarray | N
         path: ending in .xml, .yml or .yaml.
         camera: of the model "opencv", "fisheye" or "division"; OpenCV itself computes nothing with the last.
         covariance: (4 + n, 4 + n), of fx, fy, cx, cy and the n coefficients; None writes none.
+
+    Raises:
+        ValueError: "polynomial12", see `convert`; a covariance of another shape; another suffix.
     """
     path, coefficients = Path(path), camera.coefficients
     scalars = {"image_width": camera.width, "image_height": camera.height}
@@ -190,6 +196,9 @@ def read_ros(path: str | Path) -> Camera:
 
     Reads a recorded topic as well. plumb_bob and rational_polynomial become "opencv", equidistant becomes "fisheye".
     The rectification and projection matrices are ignored: they describe a rectified view.
+
+    Raises:
+        ValueError: a file of another form, or a camera that no model here computes exactly.
     """
     documents = parse_documents(Path(path), read_text(Path(path)))
     documents[0].get("distortion_model")
@@ -203,6 +212,9 @@ def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None
         path: to write.
         camera: "fisheye", or "opencv" without prism and tilt.
         name: of the camera.
+
+    Raises:
+        ValueError: a model, or coefficients, that the file cannot hold; see `convert`.
     """
     coefficients = fit_coefficients(camera, (5, 8))
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
@@ -235,6 +247,9 @@ def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
     Args:
         path: to write.
         cameras: by their names, such as cam0; "fisheye", or "opencv" with k1, k2, p1, p2 only.
+
+    Raises:
+        ValueError: a model, or coefficients, that the file cannot hold; see `convert`.
     """
     chains = {
         name: {

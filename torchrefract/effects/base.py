@@ -240,6 +240,8 @@ class Effect(nn.Module, ABC):
             image, depth: as for `degrade`.
             params: of `params_type`, with B rows.
             frame: number of the (first) frame, for the same draw at another time; None keeps that of `params`.
+
+        Raises: as for `degrade` and `check_params`.
         """
         if params is None and callable(image) and not isinstance(image, Tensor):
             return super().apply(cast(Callable[[nn.Module], None], image))

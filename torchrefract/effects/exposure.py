@@ -63,7 +63,9 @@ class ExposureParams(NamedTuple):
 
 
 class Exposure(PhotometricEffect):
-    """Automatic exposure, in linear light x: I = quantize(clip(G x + n, 0, 1)), G = (target / mean)^gamma.
+    """Automatic exposure, in linear light x.
+
+        I = quantize(clip(G x + n, 0, 1)),  G = ((target + 0.001) / (mean + 0.001))^gamma
 
     The mean is that of the frame over a lattice, in which light of more than 16 times white counts as that. The noise
     n is normal with the variance shot G x + read G^2. `valid` are the pixels that do not saturate. NaN and infinite
@@ -74,13 +76,14 @@ class Exposure(PhotometricEffect):
     So with a time constant, a frame of a clip depends on those before it; without, each is exposed by itself.
 
     Args:
-        target_range: mean linear light after the gain; 0.18 is a gray card.
-        gamma_range: 1 reaches the target, 0 is no exposure.
+        target_range: mean linear light after the gain, in [0.001, 1]; 0.18 is a gray card.
+        gamma_range: in [0, 4]; 1 reaches the target, 0 is no exposure.
         min_gain: lowest G, in [1/32, 1].
         max_gain: highest G, in [1, 4].
-        time_constant_range: tau in frames.
-        shot_range: variance of the noise for each unit of light; 0.001 is that of a sensor with 1000 electrons.
-        read_range: variance of the noise in the dark.
+        time_constant_range: tau in frames, 0 or above.
+        shot_range: variance of the noise for each unit of light, in [0, 1]; 0.001 is that of a sensor with 1000
+            electrons.
+        read_range: variance of the noise in the dark, in [0, 1].
         quantize: round the result to 1/255, with the gradient of the unrounded one.
         tolerance: all of the effect is computed under any tolerance. Without noise, pixels may be off by 0.06 levels
             of 1/255 for G up to 2, and by 0.4 up to 4.

@@ -214,7 +214,7 @@ class UniformFog(PhotometricEffect):
     8 bits.
 
     Args:
-        visibility_range: V in m, above 0, inf for clear air.
+        visibility_range: V in m, above 0, inf for clear air; up to an infinite end, 1 / V is drawn uniformly.
         deviation_range: relative deviation of the extinction, within (-1, 1).
         airlight: color of the fog in [0, 1], one number for each channel or one for all, of three the luma for gray
             images; None is that of the paper,

@@ -41,11 +41,11 @@ class NightGlowParams(NamedTuple):
 class NightGlow(PhotometricEffect):
     """Glow around lamps in fog, by forward scattering in linear light: I = clip(I_clean + v, 0, 1).
 
-    v is the light that droplets scatter on its way from the lamps, L = luminance max(I - threshold, 0)^2 /
-    (1 - threshold)^2, of each channel: a camera clips lamps, which are brighter than white by an unknown factor. The
-    sum of v is (1 - exp(-T)) times that of L, so that the lamps lose as much light as the glow has. What remains of
-    them, exp(-T) L, is above white, so lamps stay as they are. Light that would leave the frame is reflected at its
-    border. See `torchrefract.fields.night_glow.glow_at_nodes` for its shape.
+    v is the light that droplets scatter on its way from the lamps,
+    L = luminance max(I - threshold, 0)^2 / (1 - threshold)^2, of each channel: a camera clips lamps, which are brighter
+    than white by an unknown factor. The sum of v is (1 - exp(-T)) times that of L, so that the lamps lose as much light
+    as the glow has. What remains of them, exp(-T) L, is above white, so lamps stay as they are. Light that would leave
+    the frame is reflected at its border. See `torchrefract.fields.night_glow.glow_at_nodes` for its shape.
 
     All lamps of a frame have one optical depth T = k d. For lamps at d meters in a visibility of V meters, T is about
     3 d / V. In a composition with fog this effect comes first, as fog darkens the lamps; or last, if the fog has a

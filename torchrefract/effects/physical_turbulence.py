@@ -77,7 +77,7 @@ class PhysicalTurbulence(WarpEffect):
     one, and the sky is still. Layers keep their form while the wind moves them (frozen flow).
 
     Sizes: with f = 1400 px and an aperture of 2 mm, Cn2 = 1e-12 moves what is 200 m away by 0.05 px, and 1e-11 what is
-    300 m away by 0.19 px. Displacements of 0.5 to 3 px are those of telephoto lenses; `Turbulence` exaggerates them for
+    300 m away by 0.18 px. Displacements of 0.5 to 3 px are those of telephoto lenses; `Turbulence` exaggerates them for
     others, see its `equivalent_cn2`. The air blurs short exposures too, which `BlurredTurbulence` adds. This blur is
     invisible where the aperture D is smaller than Fried's parameter r0: at 2 mm up to a Cn2 of 1e-12 over 1 km. The
     plan states D / r0 above 1.

@@ -71,7 +71,7 @@ class RoadMirageParams(NamedTuple):
 class RoadMirage(WarpEffect):
     """The mirage over a hot road: what stands at the horizon, mirrored in the road far ahead.
 
-        source row = 2 y_h - y  for 0 < y - y_h < f theta_c on the road,  theta_c = sqrt(2 * 2.67e-4 dT / T)
+        source row = 2 y_h - y  for 0 < y - y_h < f theta_c on the road,  theta_c = sqrt(2 * 2.67e-4 dT / T),  T = 300 K
 
     A difference dT of 5, 10, 20 and 30 K mirrors 4.2, 5.9, 8.4 and 10.2 px below the horizon for a focal length of
     1400 px, from 436, 308, 218 and 178 m on for a camera at 1.3 m. dT varies along the edge and in time, so the edge

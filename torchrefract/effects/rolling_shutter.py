@@ -80,12 +80,13 @@ class RollingShutter(WarpEffect):
     samplings. All maps and labels are those of the middle of the exposure.
 
     Args:
-        speed_range: km/h, forward along the axis of the camera; below 0 backward.
-        readout_range: ms, from the first row to the last one; below 0 for a camera that is mounted upside down.
-        exposure_range: ms, of each row.
-        pitch_range, yaw_range, roll_range: deg, amplitudes of the vibration. The K sines together have the variance of
-            one sine of the amplitude.
-        frequency_range: Hz, of the vibration; each of the K frequencies is drawn in it.
+        speed_range: km/h, within [-1000, 1000], forward along the axis of the camera; below 0 backward.
+        readout_range: ms, within [-200, 200], from the first row to the last one; below 0 for a camera that is mounted
+            upside down.
+        exposure_range: ms, of each row, in [0, 200].
+        pitch_range, yaw_range, roll_range: deg, in [0, 5], amplitudes of the vibration. The K sines together have the
+            variance of one sine of the amplitude.
+        frequency_range: Hz, in [0, 1000], of the vibration; each of the K frequencies is drawn in it.
         num_frequencies: K.
         num_exposures: times that are averaged if there is an exposure.
         fps: frames per second of clips.

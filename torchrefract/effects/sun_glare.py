@@ -98,16 +98,16 @@ class SunGlare(PhotometricEffect):
         center_x_range, center_y_range: of the sun, in widths and heights from the upper left corner of the frame; both
             or none, which is the sky of the frame.
         outside: probability in [0, 1] that a sun that is placed by the sky stands above the frame.
-        luminance_range: of the solar disk; white is 1, and the sun at noon some 1e5.
-        scatter_range: 1 - p1, share of its light that is scattered.
-        scale_range: p3^(-1/p4), degrees.
-        shape_range: p4.
-        num_ghosts: K.
-        ghost_radius_range: degrees.
-        ghost_share_range: of the light of the sun; two reflections of 0.5 % give 2.5e-5.
+        luminance_range: of the solar disk, in [0, 1e9]; white is 1, and the sun at noon some 1e5.
+        scatter_range: 1 - p1, share of its light that is scattered, in [0, 1].
+        scale_range: p3^(-1/p4), degrees in the image plane, in [0.01, 100].
+        shape_range: p4, in [0.1, 4].
+        num_ghosts: number of ghosts, 0 or above.
+        ghost_radius_range: degrees, in [0.01, 100].
+        ghost_share_range: of the light of the sun, in [0, 1]; two reflections of 0.5 % give 2.5e-5.
         color: of the sun, one number for each channel or one for all; gray images take the luma of three.
-        gamma_range: strength of the exposure; 0 keeps the gain of the clean frame, and above 1 the camera darkens more
-            than the mean asks for, as real ones do to keep highlights.
+        gamma_range: strength of the exposure, in [0, 4]; 0 keeps the gain of the clean frame, and above 1 the camera
+            darkens more than the mean asks for, as real ones do to keep highlights.
         min_gain: lowest G, in [1/32, 1].
         time_constant_range: of the exposure in a clip, in frames; with 0 each frame is exposed by itself.
         drift_x_range, drift_y_range: of the sun, in widths and heights per frame of a clip.

@@ -186,6 +186,8 @@ class Turbulence(WarpEffect):
             cn2: m^(-2/3), at the height of the camera, one number or a range.
             camera, aperture, inner_scale, outer_scale, height, horizon, depth: as for `PhysicalTurbulence`.
             wind: m/s, the largest one across the line of sight, from the left or the right.
+
+        Raises: as for `PhysicalTurbulence`.
         """
         ends = (cn2, cn2) if isinstance(cn2, int | float) else cn2
         return PhysicalTurbulence(

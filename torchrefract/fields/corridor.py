@@ -29,12 +29,15 @@ class CorridorDepth:
     horizon they close in to a tunnel, since what stands far away is not seen high above it. Where the sky is seen down
     to y_s(x), what stands below it ends there: if it is h high, it is z_skyline away. So open land has no walls.
     A column without sky has no z_skyline, and by day a frame without sky looks at something near, such as trees or the
-    road itself: `end` is `far`, or min(`far`, `closed`) there. Pass it as `depth=` to a fog; a depth map, or a network
-    (`torchrefract.depth.from_transformers`), is better.
+    road itself: `end` is `far`, or min(`far`, `closed`) there; 1 / end is linear between the two in frames of which the
+    sky takes less than a tenth. y_s is the lowest row of the sky around a column. Pass it as `depth=` to a fog; a depth
+    map, or a network (`torchrefract.depth.from_transformers`), is better.
+
+    Numbers out of range raise ValueError.
 
     camera_height, focal, horizon, spread: of the road, as for `GroundPlaneDepth`.
-    side: m, w, from the camera to each wall.
-    vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge.
+    side: m, w, from the camera to each wall, above 0.
+    vanishing: x_v, where the road vanishes, 0 at the left edge of the frame and 1 at its right edge, in [-10, 10].
     height: m, h, of what stands beside the road, above `camera_height`.
     far: m, the largest depth outside of the sky.
     closed: m, the largest depth of a frame by day that shows no sky.

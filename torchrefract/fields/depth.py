@@ -40,7 +40,7 @@ class DepthProvider(ABC):
 class LinearDepth(DepthProvider):
     """The ramp over the rows of the paper: d(y) = (1 - (y + 1/2) / H) max_depth.
 
-    max_depth: m, at the top edge of the frame, in [0, 1e12].
+    max_depth: m, at the top edge of the frame, in [0, 1e12]; another number raises ValueError.
     """
 
     max_depth: float = 160.0
@@ -65,8 +65,10 @@ class GroundPlaneDepth(DepthProvider):
     The camera is a pinhole that looks down by theta, tan(theta) = (c_y - y_h) / f, so sqrt(...) is f / cos(theta). A
     spread averages inverse depth over normally distributed horizons.
 
-    camera_height: m, h, above the road.
-    focal: f, focal length of the pinhole, widths of the frame.
+    Numbers out of range raise ValueError.
+
+    camera_height: m, h, above the road, above 0.
+    focal: f, focal length of the pinhole, widths of the frame, above 0.
     horizon: its position, 0 at the top edge of the frame and 1 at its bottom edge, in [-10, 10].
     spread: standard deviation of an uncertain horizon, in heights of the frame, in [0, 10]; depth then grows smoothly
         across the horizon instead of jumping there.

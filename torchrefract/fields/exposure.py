@@ -38,11 +38,11 @@ def metered_mean(light: Tensor) -> Tensor:
 
 
 def exposure_gain(mean: Tensor, target: Tensor, gamma: Tensor, *, low: float, high: float) -> Tensor:
-    """Return the gain G = (target / mean)^gamma, limited to [low, high].
+    """Return the gain G = ((target + 0.001) / (mean + 0.001))^gamma, limited to [low, high].
 
     Args:
         mean: metered light, at least 0; white is 1.
-        target: mean that the camera aims at, at least 0. To both 0.001 is added, so that a black frame has a gain.
+        target: mean that the camera aims at, at least 0. The 0.001 gives a black frame a gain.
         gamma: 1 reaches the target, 0 leaves the frame as it is.
         low, high: limits, above 0.
     """

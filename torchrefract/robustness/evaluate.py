@@ -149,12 +149,17 @@ class Robustness:
         Args:
             scene: one with a quantity.
             loss: share of the mean score of the clean images, in (0, 1).
+
+        Raises:
+            ValueError: a scene without a quantity, a loss out of range, or clean images of the score 0.
         """
         loss = check_number("loss", loss, low=1e-6, high=1 - 1e-6)
         if not self.clean.any():
             raise ValueError("the mean score of the clean images must be above 0, got 0: check labels and classes")
         if scene not in self.quantities:
-            raise ValueError(f"scene must be one with a quantity: {', '.join(self.quantities)}, got {scene}")
+            raise ValueError(
+                f"scene must be one with a quantity ({', '.join(self.quantities) or 'no scene has one'}), got {scene}"
+            )
         levels = [level for level in self.scores if level.scene == scene]
         values, scores = (np.stack([by[level] for level in levels]) for by in (self.values, self.scores))
         least, is_harm = (1 - loss) * float(self.clean.mean()), self.quantities[scene].is_harm
@@ -168,9 +173,18 @@ class Robustness:
             of: "score" for the mean over the images, "worst_case" for that of their worst cases, or the name of a score
                 of all images together, such as "mAP".
 
+        Raises:
+            ValueError: a scene that was not scored, or a score that the run has not.
+
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
-        scenes = [scene] if scene else list(dict.fromkeys(level.scene for level in self.scores))
+        scenes = list(dict.fromkeys(level.scene for level in self.scores))
+        if scene is not None and scene not in scenes:
+            raise ValueError(f"scene must be one of {', '.join(scenes)}, got {scene}")
+        names = ["score", *(["worst_case"] if self.worst_case else []), *self.set_scores.get(None, ())]
+        if of not in names:
+            raise ValueError(f"of must be one of {', '.join(names)}, got {of}")
+        scenes = scenes if scene is None else [scene]
         means = [np.mean([self._value(of, level) for level in self.scores if level.scene == s]) for s in scenes]
         return float(np.mean(means))
 

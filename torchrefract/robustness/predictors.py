@@ -52,7 +52,8 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
         device: of models in PyTorch.
 
     Returns:
-        A function without gradients. Detections of transformers and Ultralytics have scores of at least 0.05.
+        A function without gradients. Detections of transformers and Ultralytics have scores of at least 0.05, those of
+        torchvision of at least the `score_thresh` of the model.
 
     Raises:
         ImportError: the library of the model is not installed.

@@ -143,6 +143,9 @@ def jacobian_determinant(flow: Tensor) -> Tensor:
     Returns:
         (B, 1, H, W), area sampled for each px^2 of the result.
 
+    Raises:
+        ValueError: a flow of another shape.
+
     Source: Choi and Lee, "Injectivity conditions of 2D and 3D uniform cubic B-spline functions", Graphical Models 62
     (2000), for the use of corner determinants.
     """
@@ -221,7 +224,14 @@ def folding(flow: Tensor, valid: Tensor | None = None) -> Folding:
     Returns:
         fraction: (B,), of all pixels.
         min_determinant: (B,), of `jacobian_determinant`; inf if no pixel counts.
+
+    Raises:
+        ValueError: a flow of another shape; a mask that is not bool or not of that shape.
     """
+    check_flow("flow", flow)
+    shape = (len(flow), 1, *flow.shape[2:])
+    if valid is not None and (check_tensor("valid", valid).dtype is not torch.bool or valid.shape != shape):
+        raise ValueError(f"valid must be bool of shape {shape}, as the flow, got {valid.dtype} of {tuple(valid.shape)}")
     determinant = _valid_determinant(flow, valid).flatten(1)
     return Folding((determinant <= 0).to(determinant.dtype).mean(dim=1), determinant.amin(dim=1))
 

@@ -79,6 +79,23 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
+def file_limit() -> Callable[[int], Any]:
+    """Return a context manager in which writing to a file fails after some bytes, as on a full disk."""
+    resource = pytest.importorskip("resource", reason="Windows has no such limit")
+
+    @contextmanager
+    def limit(num_bytes: int) -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limit
+
+
+@pytest.fixture
 def memory(monkeypatch) -> Iterator[Any]:
     """Return the empty store memory://, without pauses before further tries."""
     monkeypatch.setattr("torchrefract._io._PAUSES", (0.0, 0.0, 0.0))

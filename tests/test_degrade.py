@@ -23,7 +23,7 @@ from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
-from torchrefract.data.media import read_video
+from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.files import decode_flow, encode_flow
 
 NAMES = ("a.png", "one/b.png", "one/two/c.bmp")
@@ -168,6 +168,22 @@ def test_fog_takes_depth_maps(call, folder):
     for name in NAMES:
         expected = degraded(folder, name, near).image[0]
         assert (read_image(folder / "given" / name) - expected).abs().max() < 0.51 / 255 + 1e-4
+
+
+def test_files_whose_depth_map_changed_after_they_were_degraded_are_degraded_again(call, folder):
+    (folder / "raw" / "one").rename(folder / "one")  # one picture is enough
+    write_video([picture(16, 32)] * 2, folder / "raw" / "c.mp4", fps=10, size=(32, 16))
+    maps = [folder / "depth" / name for name in ("a.png", "c.mp4/000000.png", "c.mp4/000001.png")]
+    for path, size in zip(maps, ((48, 96), (16, 32), (16, 32)), strict=True):
+        write(path, np.full(size, 30 * 256, np.uint16))
+    words = ("source=raw", "scene=cape_town_fog", "workers=0", "out=out", "depth=depth")
+    assert call("degrade", *words).code == 0
+    before = (folder / "out" / "a.png").read_bytes()
+    write(maps[0], np.full((48, 96), 60 * 256, np.uint16))
+    assert call("degrade", *words).out.startswith("out: 1 degraded, 1 already existed, 0 skipped")
+    assert (folder / "out" / "a.png").read_bytes() != before
+    write(maps[2], np.full((16, 32), 60 * 256, np.uint16))
+    assert call("degrade", *words).out.startswith("out: 1 degraded, 1 already existed, 0 skipped")
 
 
 def video(path: Path) -> None:

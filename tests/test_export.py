@@ -101,6 +101,13 @@ def test_a_model_with_several_passes_is_rejected(call, brighter, monkeypatch):
     assert message == f"ckpt_path must be of a model that restores in a single pass, got {brighter} of Diffusion"
 
 
+def test_a_full_disk_is_one_line_of_error(call, tmp_path, brighter, file_limit):
+    with file_limit(1000):
+        outcome = call("export", f"ckpt_path={brighter}", "out=model.pt2")
+    assert outcome.message == "out must name what can be read or written, got model.pt2: File too large"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("word", "message"),
     [

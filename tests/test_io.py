@@ -36,12 +36,13 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_error_of_writing_names_the_file(tmp_path):
+@pytest.mark.parametrize("is_named", [False, True])
+def test_an_error_of_writing_names_the_file(tmp_path, is_named):
     with (
         pytest.raises(OSError, match=r"No space left on device: '.*/panel.png'$"),
-        replace_file(tmp_path / "panel.png"),
+        replace_file(tmp_path / "panel.png") as temporary,
     ):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device", str(temporary) if is_named else None)
 
 
 def test_a_report_may_hold_names_of_files_that_are_no_unicode(tmp_path):

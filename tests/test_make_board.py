@@ -59,3 +59,11 @@ def test_every_board_is_detected(call, tmp_path, option, board):
 def test_invalid_options_are_one_line_of_error(call, tmp_path, options, message):
     assert call("make_board", *options).message == message
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["board.pdf", "board.png"])
+def test_a_full_disk_is_one_line_of_error(call, tmp_path, file_limit, name):
+    with file_limit(100):
+        outcome = call("make_board", f"out={name}", "dpi=50")
+    assert outcome.message == f"{name} could not be written: File too large"
+    assert not list(tmp_path.iterdir())

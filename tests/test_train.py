@@ -303,7 +303,7 @@ def test_initial_weights_of_another_model_are_one_line_of_error(call, small, wor
             ("scene=paper_refractive", "data.border=black"),
             "data: border must be null unless the scene is a lens that fills its frames, got black",
         ),
-        (("run_dir=/dev/null/run",), "run_dir: "),
+        (("run_dir=/dev/null/run",), "run_dir must name what can be read or written, got /dev/null/run: "),
         (("model.lr=nan",), "model: lr must not be NaN, got nan"),
         (("model.weight_decay=-1",), "model: weight_decay must be a number of at least 0, got -1"),
         (("model.warmup_steps=-1",), "model: warmup_steps must be at least 0, got -1"),

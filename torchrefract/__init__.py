@@ -30,6 +30,14 @@ import sys as _sys
 
 if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     # Python has this argv while `python -m torchrefract.<command>` imports the package, and torch takes seconds.
+    def _show_error(kind, error, traceback):
+        """Print one line for Ctrl-C, and a traceback for any other error."""
+        if kind is KeyboardInterrupt:
+            print("stopped", file=_sys.stderr, flush=True)
+        else:
+            _sys.__excepthook__(kind, error, traceback)
+
+    _sys.excepthook = _show_error
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
 from torchrefract.cameras.camera import Camera

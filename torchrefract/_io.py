@@ -184,7 +184,8 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # that of a full disk names no file
+        if error.filename in (None, str(temporary)):  # that of a full disk names no file
+            error.filename = str(path)
         raise
     finally:
         temporary.unlink(missing_ok=True)

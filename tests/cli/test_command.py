@@ -1,11 +1,15 @@
 import errno
 import io
+import os
 import random
 import re
 import shlex
+import signal
+import subprocess
 import sys
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import prepare_arguments, progress, quote_text, run
 from torchrefract.cli.entry import command
-from torchrefract.cli.options import naming
+from torchrefract.cli.options import disk_errors, naming
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
@@ -74,6 +78,10 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
         (FileExistsError(errno.EEXIST, "File exists", "a.yaml"), "a.yaml could not be written: File exists"),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b could not be written: Not a directory"),
         (PermissionError(errno.EACCES, "Permission denied", "frames"), "frames could not be opened: Permission denied"),
+        (
+            RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "),
+            "data.workers must fit the memory, got one that ended (DataLoader worker (pid 7) is killed by signal: Kill",
+        ),
     ):
         with pytest.raises(SystemExit) as stop:
             run_main(lambda error=error: fail(error))
@@ -93,6 +101,37 @@ def test_an_interrupt_while_a_command_loads_is_one_line(capsys, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         command("degrade", "", "degradation:degrade")()
     assert (stop.value.code, capsys.readouterr().err) == (130, "stopped\n")
+
+
+def test_ctrl_c_while_the_package_is_imported_is_one_line():
+    words = [sys.executable, "-m", "torchrefract.degrade"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    options = {"env": environment, "stderr": subprocess.PIPE, "text": True}
+    # A shell lets programs in the background ignore it.
+    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(words, **options) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "torchrefract: loading …\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.read() == "stopped\n"
+    assert process.returncode not in (None, 0)
+
+
+@pytest.mark.quick
+def test_an_output_whose_reader_has_ended_stops_a_command_in_one_line(run_main, capsys, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+
+    def write() -> None:
+        with disk_errors(Path("out")):
+            print("3 pairs exist already", flush=True)
+
+    with open(writer, "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        with pytest.raises(SystemExit) as stop:
+            run_main(write)
+    message = "stopped, as the reader of the output has ended; the same command continues\n"
+    assert (stop.value.code, capsys.readouterr().err) == (1, message)
 
 
 @pytest.mark.quick

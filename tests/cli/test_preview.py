@@ -467,6 +467,14 @@ def test_frames_that_cannot_be_played_are_one_line_of_error(call, frames, pictur
     assert not (tmp_path / "flare.gif").exists()
 
 
+@pytest.mark.parametrize("name", ["flare.pdf", "flare.png"])
+def test_a_contact_sheet_on_a_full_disk_is_one_line_of_error(call, picture, tmp_path, file_limit, name):
+    with file_limit(100):
+        outcome = call("preview", "frame.png", *FLARE, f"out={name}")
+    assert outcome.message == f"{name} could not be written: File too large"
+    assert list(tmp_path.iterdir()) == [picture]
+
+
 def test_a_full_disk_keeps_the_old_animation(call, picture, tmp_path, monkeypatch):
     def render(self, times):
         yield next(original(self, times))

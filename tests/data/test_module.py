@@ -1,4 +1,6 @@
 import multiprocessing
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -17,6 +19,18 @@ QUIET: dict[str, Any] = {
     **{"accelerator": "cpu", "logger": False, "enable_checkpointing": False},
     **{"enable_progress_bar": False, "enable_model_summary": False},
 }
+
+FAILS = """
+import sys
+from torch.utils.data import DataLoader
+from torchrefract.data.workers import ignore_sigterm
+
+if __name__ == "__main__":
+    loader = DataLoader([0, 1, 2], num_workers=1, worker_init_fn=ignore_sigterm, persistent_workers=True)
+    sys.frames = iter(loader)  # as a traceback keeps it
+    next(sys.frames)
+    sys.exit(3)
+"""
 
 
 def scenes(*, effect: LensDistortion | UniformFog | None = None, batch_size: int = 4, workers: int = 0, seed: int = 0):
@@ -279,6 +293,13 @@ def test_lightning_gets_the_same_pairs(first_epoch):
     trainer.state.fn, trainer.training = "fit", True  # pyright: ignore[reportAttributeAccessIssue]  # a word for an enum
     frame = Frame(*next(iter(data.train_dataloader())))
     assert_same(by_key([data.on_after_batch_transfer(frame, 0)]), first_epoch)
+
+
+def test_a_program_that_fails_beside_workers_that_ignore_sigterm_ends(tmp_path):
+    script = tmp_path / "fails.py"
+    script.write_text(FAILS)
+    outcome = subprocess.run([sys.executable, script], check=False, timeout=60, stderr=subprocess.PIPE)
+    assert (outcome.returncode, outcome.stderr) == (3, b"")
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,13 @@ def interrupted_save(error: Exception):
     return interrupted
 
 
+def test_a_worker_that_is_killed_while_a_checkpoint_is_written_is_not_taken_for_a_full_disk(path, monkeypatch):
+    error = RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. ")
+    monkeypatch.setattr(checkpoints.torch, "save", interrupted_save(error))
+    with pytest.raises(RuntimeError, match=r"^DataLoader worker \(pid 7\)"):
+        AtomicCheckpointIO().save_checkpoint(content(2.0), path)
+
+
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "No space left on device"), RuntimeError("[enforce fail at inline_container.cc]")]
 )

@@ -66,4 +66,5 @@ def test_a_run_folder_in_a_store_that_denies_writing_is_one_line_of_error(call, 
 
     monkeypatch.setattr(MemoryFileSystem, "put_file", deny)
     message = call("train", "+task=undistort", *small, "run_dir=memory://denied").message
-    assert message == "run_dir: [Errno 13] Permission denied: 'memory://denied/config.yaml'"
+    condition = "run_dir must name what can be read or written"
+    assert message == f"{condition}, got memory://denied/config.yaml: Permission denied"

@@ -78,6 +78,17 @@ def scores(out: Path) -> dict[str, list]:
     return {row["name"]: row["levels"] for row in map(json.loads, (out / "scores.jsonl").read_text().splitlines()[1:])}
 
 
+def test_a_picture_that_changed_after_it_was_scored_is_scored_again(call, tmp_path, frames):
+    run = (*RUN, "scene=[cheap_dashcam]", "model=gray:brightness", "out=out")
+    assert call(*run).code == 0
+    before = scores(tmp_path / "out")
+    cv2.imwrite(str(frames / "1.png"), np.full((36, 64, 3), 100, np.uint8))
+    assert call(*run).code == 0
+    after = scores(tmp_path / "out")
+    assert [name for name in after if after[name] != before[name]] == ["1.png"]
+    assert after["1.png"][0][2][0] == pytest.approx(1 - 100 / 255, abs=0.01)  # `darkness` of a gray picture
+
+
 # --- beside a base run
 
 

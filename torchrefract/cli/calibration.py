@@ -1,5 +1,6 @@
 """The commands `calibrate`, `rectify` and `make_board`."""
 
+import io
 import json
 import sys
 from collections import Counter
@@ -79,9 +80,10 @@ def make_board(cfg: DictConfig) -> None:
     margin = read_option(cfg, "margin_mm", check_number, low=0.0, high=1000.0)
     if out.suffix.lower() not in _BOARD_FORMATS:
         raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
+    page = io.BytesIO()  # matplotlib's errors of a full disk would not say so
+    board_page(board, margin_mm=margin).savefig(page, format=out.suffix[1:], dpi=dpi)
     try:
-        with replace_file(out) as path:
-            board_page(board, margin_mm=margin).savefig(path, dpi=dpi)
+        write_file(out, page.getvalue())
     except OSError as error:
         raise UsageError(f"{out} could not be written: {error.strerror}") from error
     width, height = board.size_mm

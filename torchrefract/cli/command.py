@@ -91,6 +91,7 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
     def job(cfg: DictConfig) -> None:
         with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
             function(cfg)
+            sys.stdout.flush()
 
     job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
@@ -312,6 +313,11 @@ def _one_line_errors(name: str) -> Iterator[None]:
     """Print an error that the user can fix as one line and end the program; raise any other again."""
     try:
         yield
+    except BrokenPipeError:  # as for `| head`
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), sys.stdout.fileno())  # Python flushes the output when it exits
+        print("stopped, as the reader of the output has ended; the same command continues", file=sys.stderr)
+        raise SystemExit(1) from None
     except Exception as error:  # all but the known ones are raised again
         is_missing = isinstance(error, ModuleNotFoundError)
         if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:
@@ -354,7 +360,15 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))
         return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split())
-    return _file_message(error) if isinstance(error, OSError) else None
+    return _file_message(error) if isinstance(error, OSError) else _worker_message(error)
+
+
+def _worker_message(error: Exception) -> str | None:
+    """Return one line for the error that PyTorch raises if a worker of a DataLoader was killed, None for any other."""
+    reason = str(error).strip().rstrip(".")
+    if not reason.startswith("DataLoader worker (pid"):
+        return None
+    return f"data.workers must fit the memory, got one that ended ({reason}); a training continues by ckpt_path="
 
 
 def _file_message(error: OSError) -> str | None:

@@ -293,7 +293,18 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
 def _is_complete(task: _Task, job: Degrader, stored: Mapping[str, int] | None) -> bool:
     """Return True if a file is degraded; stores, whose files are listed, hold no part of one."""
     target = job.target(task.name)
-    return media.is_complete(task.file, target) if stored is None else relative_name(target, job.out) in stored
+    if stored is not None:
+        return relative_name(target, job.out) in stored
+    return media.is_complete(task.file, target) and not any(
+        media.is_older(target, path) for path in _depth_files(task, job.depth)
+    )
+
+
+def _depth_files(task: _Task, depth: DepthFolder | None) -> Iterable[Path]:
+    """Return the depth maps of a file; none in a store, whose files have no dates to compare."""
+    if depth is None or is_remote(depth.root):
+        return ()
+    return (depth.root / task.name).glob("*") if media.is_video(task.file) else (depth.path(task.name),)
 
 
 def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, total: int) -> None:

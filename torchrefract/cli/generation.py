@@ -20,6 +20,7 @@ from rich.filesize import decimal
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils import _pytree as pytree
 
+import torchrefract
 from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
 from torchrefract._validation import (
     UsageError,
@@ -78,7 +79,8 @@ _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the m
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _TAGS = 16  # frames whose orientation is read beside a camera
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
-_VERSIONS = {"torch": torch.__version__, "numpy": np.__version__, "opencv": cv2.__version__}
+_VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
+_VERSIONS |= {"numpy": np.__version__, "opencv": cv2.__version__}
 _MESSAGE_INTERVAL = 60.0  # seconds
 
 

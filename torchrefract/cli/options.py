@@ -47,8 +47,9 @@ def naming(part: str) -> Iterator[None]:
     except (*FILE_ERRORS, ModuleNotFoundError):
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
-        if isinstance(error, FileNotFoundError) and error.filename:
-            raise UsageError(f"{part} must name what exists, got {error.filename}: {error.strerror}") from error
+        if isinstance(error, OSError) and error.filename:
+            condition = "exists" if isinstance(error, FileNotFoundError) else "can be read or written"
+            raise UsageError(f"{part} must name what {condition}, got {error.filename}: {error.strerror}") from error
         is_named = str(error).startswith(f"{part} must ")
         raise UsageError(str(error) if is_named else f"{part}: {error}") from error
 
@@ -215,6 +216,8 @@ def disk_errors(out: Path) -> Iterator[None]:
     """Turn errors of the disk into messages for the user; files that are written stay."""
     try:
         yield
+    except BrokenPipeError:  # of the standard output
+        raise
     except OSError as error:
         if error.errno in _DISK_FULL:
             raise UsageError(

@@ -1,5 +1,6 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
+import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -75,7 +76,10 @@ def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, 
         with naming(name):
             rows.append(contact_sheet_row(name, effect, frame=frame, depth=depth, seed=seed))
     height, width = frame.shape[2:]
-    contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}").savefig(path)
+    sheet = io.BytesIO()  # matplotlib's errors of a full disk would not say so
+    figure = contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}")
+    figure.savefig(sheet, format=path.suffix[1:])
+    path.write_bytes(sheet.getvalue())
 
 
 def _effects(cfg: DictConfig) -> dict[str, Effect]:

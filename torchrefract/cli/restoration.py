@@ -78,6 +78,7 @@ from torchrefract.restoration.models.lens_net import LensEncoder
 from torchrefract.restoration.module import Restoration, RestorationModule
 from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint, write_weights
 from torchrefract.restoration.tasks import Restored, Undistort
+from torchrefract.warping.warp import INTERPOLATIONS
 
 _T = TypeVar("_T")
 _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the start of processes
@@ -204,8 +205,9 @@ def export(cfg: DictConfig) -> None:
             f"ckpt_path must be of a model that restores in a single pass, got {cfg.ckpt_path} of {loaded.name}"
         )
     height, width = loaded.size if cfg.size is None else _parse_size(str(cfg.size))
-    with naming("interpolation"):
-        errors = export_model(loaded, out, size=(height, width), interpolation=str(cfg.interpolation))
+    interpolation = read_option(cfg, "interpolation", check_choice, choices=INTERPOLATIONS)
+    with naming("out"):
+        errors = export_model(loaded, out, size=(height, width), interpolation=interpolation)
     differences = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
     print(
         f"{out}: {loaded.name} for {loaded.task}, frames of {height}x{width}, any batch size; "

@@ -152,7 +152,11 @@ def test_robustness(cfg: DictConfig) -> None:
         )
     with naming("out"):
         out.mkdir(parents=True, exist_ok=True)
-    with locked("out", out), stored_scores(out / SCORES, settings) as (done, store), warnings.catch_warnings():
+    with (
+        locked("out", out),
+        stored_scores(out / SCORES, settings, folder.path) as (done, store),
+        warnings.catch_warnings(),
+    ):
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
         names = progress(folder.names, "scoring", count=len(folder.names))

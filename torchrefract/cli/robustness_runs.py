@@ -36,9 +36,12 @@ REFERENCE_WIDTH = 1920  # px, of frames for which scenes are described; their qu
 
 @contextmanager
 def stored_scores(
-    path: Path, settings: Mapping[str, Any]
+    path: Path, settings: Mapping[str, Any], data: Path
 ) -> Iterator[tuple[dict[str, Scored], Callable[[str, Scored], None]]]:
-    """Yield the scores of an earlier run, and a function that stores those of a picture."""
+    """Yield the scores of an earlier run, and a function that stores those of a picture of the folder `data`.
+
+    Scores of pictures that changed since are left out.
+    """
     lines = _complete_lines(path)
     if len(lines) == 1:
         lines = []  # of a run that scored nothing
@@ -50,13 +53,15 @@ def stored_scores(
                 f"out must be a folder of the same settings, got one with {', '.join(changed)}; choose another"
             )
         _check_versions(before.get("versions") or {})
+        lines[1:] = [line for line in lines[1:] if _is_current(json.loads(line), data)]
     done = dict(map(parse_scores, lines[1:]))
     write_file(path, "".join(lines) or json.dumps({**settings, "versions": _VERSIONS}) + "\n", alone=True)
     with path.open("a", encoding="utf-8") as stream:
 
         def store(name: str, scored: Scored) -> None:
             levels = [[*level, of] for level, of in scored.levels.items()]
-            stream.write(json.dumps({"name": name, "clean": scored.clean, "levels": levels}) + "\n")
+            row = {"name": name, "clean": scored.clean, "levels": levels, "date": _date_of(data / name)}
+            stream.write(json.dumps(row) + "\n")
             stream.flush()
 
         yield done, store
@@ -118,6 +123,16 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     scenes, severities = (sorted({level[i] for level in levels}) for i in range(2))
     paths = {name: settings[name] and str(Path(settings[name]).expanduser().resolve()) for name in ("data", "depth")}
     return paths | {"scene": scenes, "severity": severities} | {name: settings.get(name) for name in _SHARED}
+
+
+def _date_of(path: Path) -> int | None:
+    """Return the time of the last change of a file, ns; None if it does not exist."""
+    return path.stat().st_mtime_ns if path.is_file() else None
+
+
+def _is_current(row: Mapping[str, Any], data: Path) -> bool:
+    """Return True if a picture is the one that was scored; earlier versions stored no date."""
+    return row.get("date") in (None, _date_of(data / row["name"]))
 
 
 def _complete_lines(path: Path) -> list[str]:

@@ -1,9 +1,11 @@
 """Work in processes of one thread each, which end with the process that started them."""
 
+import atexit
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -21,6 +23,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _QUEUED_ITEMS = 2  # for each worker, so that none waits
+_PATIENCE = 1.0  # seconds that daemons have to end
 
 
 def map_in_processes(
@@ -79,6 +82,20 @@ def ignore_sigterm(worker: int) -> None:
     before it has saved its checkpoint.
     """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+@atexit.register  # behind the function of multiprocessing, and so it is called before that
+def _end_daemons() -> None:
+    """End the daemons of this process as Python does, but kill those that ignore SIGTERM, for which it would wait."""
+    daemons = [process for process in multiprocessing.active_children() if process.daemon]
+    if daemons and hasattr(signal, "SIGCHLD"):
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # PyTorch's handler raises for a worker that is killed
+    for process in daemons:
+        process.terminate()
+    end = time.monotonic() + _PATIENCE
+    for process in daemons:
+        process.join(max(0.0, end - time.monotonic()))
+        process.kill()
 
 
 def num_cores() -> int:

@@ -49,6 +49,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                 torch.save(checkpoint, temporary)
         # If the disk is full, torch raises a RuntimeError of its archive writer.
         except (OSError, RuntimeError) as error:
+            if str(error).startswith("DataLoader worker"):  # killed at this time, for which PyTorch interrupts
+                raise
             previous = f"; {path} of an earlier epoch is intact" if path.exists() else ""
             reason = error.strerror if isinstance(error, OSError) else "the disk may be full"
             raise CheckpointError(

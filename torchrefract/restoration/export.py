@@ -1,6 +1,7 @@
 """Export a model to a file that runs without torchrefract: a program of `torch.export` or of ONNX."""
 
 import importlib
+import io
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -74,7 +75,9 @@ def save_program(
     """Write a program, the names of its outputs and its metadata in the format of the suffix."""
     text = json.dumps(metadata)
     if path.suffix == ".pt2":
-        torch.export.save(program, path, extra_files={METADATA: text})
+        archive = io.BytesIO()  # torch's writer of files ends the process on a full disk
+        torch.export.save(program, archive, extra_files={METADATA: text})
+        path.write_bytes(archive.getbuffer())
         return
     logging.getLogger("onnxscript").setLevel(logging.ERROR)  # it warns of operators that it does not optimize
     logging.getLogger("onnx_ir").setLevel(logging.WARNING)

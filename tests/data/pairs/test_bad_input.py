@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import torchrefract
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.files import DamagedPairError
 
@@ -145,6 +146,15 @@ def test_an_interrupted_run_prints_how_to_continue(call, words, monkeypatch):
     outcome = call("generate", *words("out"))
     assert (outcome.code, outcome.err) == (130, "")
     assert outcome.out.endswith("stopped; the same command continues\n")
+
+
+def test_a_set_of_another_version_of_torchrefract_is_continued_with_a_word(call, words, tmp_path):
+    assert call("generate", *words("out", "count=1")).code == 0
+    path = tmp_path / "out" / "config.json"
+    path.write_text(path.read_text().replace(f'"torchrefract": "{torchrefract.__version__}"', '"torchrefract": "0.0"'))
+    outcome = call("generate", *words("out", "count=1"))
+    assert outcome.code == 0
+    assert "existing pairs were made with {'torchrefract': '0.0', " in outcome.out
 
 
 def test_a_read_only_folder_raises(call, words, disk):

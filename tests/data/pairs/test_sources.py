@@ -1,6 +1,8 @@
 """Sources of pairs: images and frames of videos, in any order."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -13,7 +15,7 @@ from torchrefract.data.images import UnreadableImageError, fit, read_image
 from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.generator import SourceReader
-from torchrefract.data.pairs.sources import draw_of, find_sources
+from torchrefract.data.pairs.sources import Sources, draw_of, find_sources, table_of
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
 FRAMES = 9
@@ -41,6 +43,21 @@ def test_a_video_that_ends_early_raises(videos):
     with pytest.raises(UnreadableImageError, match=r"a\.mp4 ends before its frame 9"):
         reader.read(Source("a.mp4", "a", "train", FRAMES))
     assert reader.read(Source("a.mp4", "a", "train", 1)).shape == (3, 32, 48)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts the threads in /proc")
+def test_a_list_is_read_without_threads_which_could_abort_a_process_that_ends(tmp_path):
+    frames = [Source(f"{number}.png", ".", "train") for number in range(3)]
+    Sources(tmp_path, table_of(frames, lambda _: 7)).write(tmp_path / "list.parquet", {"every": 1})
+    code = (
+        "import os, pathlib, sys; from torchrefract.data.pairs.sources import read_sources; "
+        "before = len(os.listdir('/proc/self/task')); path = pathlib.Path(sys.argv[1]); "
+        "frames = read_sources(path, path.parent, {'every': 1}); "
+        "print(len(os.listdir('/proc/self/task')) - before, *frames.frames(), sep='|')"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "list.parquet")]
+    started, *read = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip().split("|")
+    assert (started, read) == ("0", [str(frame._replace(bytes=7)) for frame in frames])
 
 
 @pytest.mark.parametrize("size", [None, (40, 60), (20, 30)])

@@ -90,7 +90,8 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         UsageError: the file is not such a list, or other options were given when it was written.
     """
     try:
-        table = pq.read_table(pa.BufferReader(read_bytes(path)))
+        # A thread of PyArrow that frees the bytes while Python exits would abort the process.
+        table = pq.ParquetFile(pa.BufferReader(read_bytes(path))).read(use_threads=False)
         about = {name.decode(): json.loads(text) for name, text in (table.schema.metadata or {}).items()}
         previous, skipped = about["options"], about["skipped"]
     except (pa.ArrowInvalid, ValueError, KeyError) as error:

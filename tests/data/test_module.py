@@ -23,10 +23,12 @@ QUIET: dict[str, Any] = {
 FAILS = """
 import sys
 from torch.utils.data import DataLoader
-from torchrefract.data.workers import ignore_sigterm
+from torchrefract.data import workers
+
+workers._PATIENCE = 0.5
 
 if __name__ == "__main__":
-    loader = DataLoader([0, 1, 2], num_workers=1, worker_init_fn=ignore_sigterm, persistent_workers=True)
+    loader = DataLoader([0, 1, 2], num_workers=1, worker_init_fn=workers.ignore_sigterm, persistent_workers=True)
     sys.frames = iter(loader)  # as a traceback keeps it
     next(sys.frames)
     sys.exit(3)

@@ -23,7 +23,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _QUEUED_ITEMS = 2  # for each worker, so that none waits
-_PATIENCE = 1.0  # seconds that daemons have to end
+_PATIENCE = 10.0  # seconds that daemons have to end, which may not be of this library
 
 
 def map_in_processes(

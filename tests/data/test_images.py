@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from torchrefract.data.images import UnreadableImageError, files_in, fit, image_size, pixels_of, read_image
+from torchrefract.data.images import OPENCV_LOG, UnreadableImageError, files_in, fit, image_size, pixels_of, read_image
 
 RNG = np.random.default_rng(0)
 PIXELS = RNG.integers(0, 256, (36, 50, 3), dtype=np.uint8)
@@ -182,10 +182,10 @@ def test_damage_between_header_and_end_raises_on_reading(tmp_path, capfd):
     data[middle : middle + 200] = bytes(200)
     (tmp_path / "frame.png").write_bytes(data)
     assert image_size(tmp_path / "frame.png") == (36, 50)
-    level = cv2.utils.logging.getLogLevel()
+    level = OPENCV_LOG.getLogLevel()
     with pytest.raises(UnreadableImageError, match=r"frame\.png is damaged"):
         read_image(tmp_path / "frame.png")
-    assert cv2.utils.logging.getLogLevel() == level
+    assert OPENCV_LOG.getLogLevel() == level
     assert "WARN" not in capfd.readouterr().err
 
 

@@ -28,7 +28,7 @@ from torchrefract import Camera
 from torchrefract.cameras import io as camera_io
 from torchrefract.cameras.lens_database import COLUMNS, read_lenses
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.images import UnreadableImageError, image_size, read_image
+from torchrefract.data.images import OPENCV_LOG, UnreadableImageError, image_size, read_image
 from torchrefract.data.pairs import PairedFolder
 from torchrefract.data.pairs.files import FORMATS, DamagedPairError, PairArrays, encode_pair
 from torchrefract.data.pairs.manifest import PairRow, StoredFile, read_row
@@ -262,15 +262,15 @@ def test_an_image_that_claims_a_huge_size_takes_no_memory(claim, tmp_path):
 def test_threads_that_read_images_keep_the_log_level(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(PNG)
-    expected, before = read_image(path), cv2.utils.logging.getLogLevel()
-    level = cv2.utils.logging.LOG_LEVEL_WARNING
-    cv2.utils.logging.setLogLevel(level)
+    expected, before = read_image(path), OPENCV_LOG.getLogLevel()
+    level = 3  # warnings
+    OPENCV_LOG.setLogLevel(level)
     try:
         with ThreadPoolExecutor(8) as pool:
             results = list(pool.map(lambda _: read_image(path), range(400)))
-        assert cv2.utils.logging.getLogLevel() == level
+        assert OPENCV_LOG.getLogLevel() == level
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        OPENCV_LOG.setLogLevel(before)
     assert all(torch.equal(image, expected) for image in results)
 
 

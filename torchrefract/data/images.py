@@ -45,6 +45,8 @@ _PNG_DEPTH = 24  # position of the bits of a channel
 _ORIENTATION = 0x0112
 _EXIF_PREFIX = b"Exif\0\0"
 _TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that swap height and width
+OPENCV_LOG: Any = getattr(cv2.utils, "logging", cv2)  # has the functions of the log level in OpenCV 5; cv2 in 4
+OPENCV_SILENT = 0
 _LOG_LOCK = Lock()
 _log_levels: list[int] = []  # OpenCV's previous log level, once for each thread that has silenced it
 
@@ -388,7 +390,7 @@ def _silent_opencv() -> Iterator[None]:
     """Silence OpenCV's log, because failures raise an error."""
     # The level belongs to the process: of threads that decode at once, the first sets it, and the last restores it.
     with _LOG_LOCK:
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        level = OPENCV_LOG.setLogLevel(OPENCV_SILENT)
         _log_levels.append(_log_levels[0] if _log_levels else level)
     try:
         yield
@@ -396,7 +398,7 @@ def _silent_opencv() -> Iterator[None]:
         with _LOG_LOCK:
             level = _log_levels.pop()
             if not _log_levels:
-                cv2.utils.logging.setLogLevel(level)
+                OPENCV_LOG.setLogLevel(level)
 
 
 def _check_complete(path: str | Path, stream: BinaryIO, length: int) -> None:

@@ -19,6 +19,8 @@ from torchrefract._validation import UsageError, first_names, warn
 from torchrefract.data.frames import list_files
 from torchrefract.data.images import (
     EXTENSIONS,
+    OPENCV_LOG,
+    OPENCV_SILENT,
     UnreadableImageError,
     describe_folders,
     exif_of_result,
@@ -59,7 +61,7 @@ __all__ = [
 ]
 
 # OpenCV prints to the terminal; problems are raised as errors instead.
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+OPENCV_LOG.setLogLevel(OPENCV_SILENT)
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".gif", ".m4v", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".3gp")
 

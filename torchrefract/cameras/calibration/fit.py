@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +19,8 @@ from torchrefract.cameras.projection import COEFFICIENTS
 
 _RADIAL_ONLY = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 _RATIONAL, _PRISM = cv2.CALIB_RATIONAL_MODEL, cv2.CALIB_THIN_PRISM_MODEL
-_FISHEYE = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
+_OF_FISHEYE: Any = cv2 if hasattr(cv2, "CALIB_FIX_SKEW") else cv2.fisheye  # has its flags: in OpenCV 5, and in 4
+_FISHEYE = _OF_FISHEYE.CALIB_RECOMPUTE_EXTRINSIC | _OF_FISHEYE.CALIB_FIX_SKEW
 _FLAGS = {
     "opencv0": _RADIAL_ONLY | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2,
     "opencv1": _RADIAL_ONLY | cv2.CALIB_FIX_K2,
@@ -29,8 +30,8 @@ _FLAGS = {
     "opencv8": _RATIONAL,
     "opencv12": _RATIONAL | _PRISM,
     "opencv14": _RATIONAL | _PRISM | cv2.CALIB_TILTED_MODEL,
-    "fisheye1": _FISHEYE | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K4,
-    "fisheye2": _FISHEYE | cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K4,
+    "fisheye1": _FISHEYE | _OF_FISHEYE.CALIB_FIX_K2 | _OF_FISHEYE.CALIB_FIX_K3 | _OF_FISHEYE.CALIB_FIX_K4,
+    "fisheye2": _FISHEYE | _OF_FISHEYE.CALIB_FIX_K3 | _OF_FISHEYE.CALIB_FIX_K4,
     "fisheye": _FISHEYE,
 }
 DIVISION = "division"

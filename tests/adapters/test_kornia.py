@@ -104,6 +104,13 @@ def test_without_kornia_the_error_names_the_package(monkeypatch):
         importlib.import_module(adapter.__name__)
 
 
+def test_a_kornia_that_leaves_labels_behind_is_refused(monkeypatch):
+    monkeypatch.setattr("kornia.__version__", "0.8.3")
+    monkeypatch.delitem(sys.modules, adapter.__name__)
+    with pytest.raises(ImportError, match=r"needs kornia 0\.9, .* got 0\.8\.3: pip install -U kornia"):
+        importlib.import_module(adapter.__name__)
+
+
 def test_extra_args_of_the_container_interpolate_masks():
     keys = {"data_keys": ["input", "mask"], "extra_args": {K.container.augment.DataKey.MASK: {"resample": "bilinear"}}}
     effect = LensDistortion(padding="border")

@@ -12,12 +12,19 @@ from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import warp_points
 
 try:
+    import kornia
     from kornia.augmentation import RigidAffineAugmentationBase2D
     from kornia.constants import Resample
     from kornia.geometry.boxes import Boxes
     from kornia.geometry.keypoints import Keypoints
 except ModuleNotFoundError as error:
     raise ImportError("this adapter needs kornia: pip install kornia") from error
+
+if tuple(map(int, kornia.__version__.split(".")[:2])) < (0, 9):
+    raise ImportError(
+        f"this adapter needs kornia 0.9, as labels do not follow the image in the containers of earlier versions, got "
+        f"{kornia.__version__}: pip install -U kornia"
+    )
 
 
 class KorniaEffect(RigidAffineAugmentationBase2D):

@@ -51,9 +51,8 @@ for frame, (x1, y1, x2, y2) in zip(frames, signs[:, 0], strict=True):
     frame[:, y1:y2, x1:x2] = torch.tensor([1.0, 0.0, 1.0])[:, None, None]
 data: Any = list(zip(frames, signs.float(), strict=True))
 loader, drawn = DataLoader(data, batch_size=8, collate_fn=collate), []
-pl.Trainer(max_epochs=1, accelerator="auto", devices=1, logger=False, enable_checkpointing=False).fit(
-    FindSign(), loader
-)
+trainer = pl.Trainer(max_epochs=1, accelerator="auto", devices=1, logger=False, enable_checkpointing=False)
+trainer.fit(FindSign(), loader)
 
 for clean, labels in loader:  # the same in a plain loop
     images, boxes = SCENE(clean.to(DEVICE), [box.to(DEVICE) for box in labels])

@@ -145,7 +145,7 @@ def test_strong_pincushions_converge_everywhere(k1):
     assert degraded.valid.all()
 
 
-@pytest.mark.filterwarnings("ignore:.*must not fold back inside the frame:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*must not fold back inside the frame:UserWarning")  # the lens folds on purpose
 def test_the_residual_of_pixels_without_an_inverse_is_finite():
     none = (0.0, 0.0)
     lens = LensDistortion(

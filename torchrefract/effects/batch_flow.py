@@ -141,13 +141,6 @@ class FlowPart(NamedTuple):
         return self._replace(samples=samples if self.samples is None else samples[self.samples])
 
 
-def flow_at_nodes(warp: WarpFlow, lattice: Lattice) -> FlowPart:
-    """Compute the flow of one warp at the nodes of a lattice, as its plan says."""
-    points = lattice.points(dtype=flow_dtype(warp.params), device=warp.active.device)
-    flow, exists = warp.masked(*warp.evaluate(warp.params, points, warp.plan))
-    return FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))
-
-
 def flow_on_measured_lattice(
     warps: Sequence[WarpFlow], *, stride: int, is_smooth: bool = True, tolerance_px: float
 ) -> list[FlowPart]:

@@ -12,7 +12,7 @@ from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import check_applied, params_per_frame, params_to, select_params
+from torchrefract.effects.batch import params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
 from torchrefract.effects.progress import Leaf, Progress
 from torchrefract.effects.warp_effect import WarpEffect
@@ -88,7 +88,7 @@ class Compose(Effect):
         self.tolerance_px = check_tolerance(tolerance_px)
 
     @property
-    def keeps_uint8(self) -> bool:
+    def keeps_uint8(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # follows from the effects
         """Return True if all effects do."""
         return all(effect.keeps_uint8 for effect in self.effects)
 
@@ -112,13 +112,6 @@ class Compose(Effect):
             )
         for effect, child in zip(self.effects, params.children, strict=True):
             effect.check_params(child, image)
-
-    def check_params(self, params: Any, image: Tensor) -> None:
-        """Raise for parameters that do not belong to these effects and this batch."""
-        if not isinstance(params, ComposeParams):
-            raise TypeError(f"params must be ComposeParams, got {type(params).__name__}")
-        check_applied(params.applied, len(image))
-        self.validate(params, image)
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """Return the composition with an exact effect wherever parameters lie outside the ranges."""
@@ -207,9 +200,8 @@ class Compose(Effect):
     ) -> None:
         """Sample the images along the composed flow of the warps at some places."""
         request = cast(PlanRequest, requests[places[0]])
-        frame = request.height, request.width
         moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
-        active = [leaf.effect.active(leaf.params, *frame) for leaf in moving]
+        active = [leaf.effect.active(leaf.params) for leaf in moving]
         moments = [leaf.effect.moments() for leaf in moving]
         parts = []
         for k in range(max(map(len, moments))):
@@ -262,13 +254,12 @@ class Compose(Effect):
             leaves, places: the warps that will be sampled together, and their places among all effects.
             request: for the composed flow.
         """
-        frame = request.height, request.width
         placed: list[Leaf] = []
         for leaf in leaves:
             effect, depth = leaf.effect, progress.depth
             params = params_per_frame(leaf.params, progress.frames)
             if placed and depth is not None and effect.depth is not None:
-                active = [before.effect.active(before.params, *frame) for before in placed]
+                active = [before.effect.active(before.params) for before in placed]
                 parts = self._parts(placed, places[: len(placed)], active, request, can_measure=False)
                 depth = progress.moved_depth(placed, active, parts)
             elif depth is None:
@@ -295,9 +286,7 @@ class Compose(Effect):
         request.remaining_px()  # raises for an unreachable tolerance
         groups, stretch = _groups(effects, requests), 1.0
         for group in groups if len(groups) > 1 else ():
-            share = replace(request, tolerance_px=request.tolerance_px / len(groups) / stretch)
-            if not share.is_reachable:
-                share = replace(request, tolerance_px=None)
+            share = replace(request, tolerance_px=request.tolerance_px / len(groups) / stretch).if_reachable()
             for place in group:
                 requests[place] = share
             stretch *= 1 + _plan_group([effects[place] for place in group], share).max_gradient
@@ -382,8 +371,7 @@ def _groups(effects: Sequence[Effect], requests: Sequence[PlanRequest | None]) -
 def _plan_group(warps: Sequence[WarpEffect], request: PlanRequest, *, can_measure: bool = True) -> CompositionPlan:
     """Plan warps that are sampled together."""
     if len(warps) == 1:
-        alone = replace(request, ulps=warps[0].rounding_ulps)
-        plan = warps[0].plan_under(alone if alone.is_reachable else replace(alone, tolerance_px=None))
+        plan = warps[0].plan_under(replace(request, ulps=warps[0].rounding_ulps).if_reachable())
         return CompositionPlan(max(plan.stride, 1), True, (plan,), plan.error_px, plan.max_gradient)
     planned = [
         PlannedWarp(

@@ -98,9 +98,9 @@ class PhotometricEffect(Effect):
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Degrade images (N, C, H, W), floating, with valid parameters of B samples."""
-        active = params.applied & ~params.is_identity
         if not self.may_change(params):
             return self._unchanged(image, params)
+        active = self.active(params)
         index = _active_samples(active, params)
         if index is not None:
             return self._degrade_samples(image, params, depth, index)

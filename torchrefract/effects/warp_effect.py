@@ -20,7 +20,7 @@ from torchrefract.effects.batch_flow import (
     SamplingOptions,
     WarpFlow,
     can_read,
-    flow_at_nodes,
+    everywhere,
     flow_dtype,
     flow_on_measured_lattice,
     zero_flow,
@@ -40,6 +40,7 @@ from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.flow import compose_flows, folding, is_shown_once
 from torchrefract.warping.grid import Points, field_dtype, inside, length
 from torchrefract.warping.invert import invert_flow
+from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
 
 # Of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more.
@@ -68,6 +69,7 @@ class WarpEffect(Effect):
         p: probability that a sample is degraded.
     """
 
+    keeps_uint8 = True  # sampling rounds its result
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
     has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
@@ -122,15 +124,10 @@ class WarpEffect(Effect):
         """
         return [0.0]
 
-    @property
-    def keeps_uint8(self) -> bool:
-        """Return True: sampling rounds its result."""
-        return True
-
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
         """Return the plan for all parameters in the ranges."""
-        request = self.plan_request(height, width, dtype).with_reachable_default()
-        return self.plan_under(request)
+        request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64, self.rounding_ulps)
+        return self.plan_under(request.with_reachable_default())
 
     def plan_under(self, request: PlanRequest) -> WarpPlan:
         """Return the plan for a request; an effect without a tolerance stays exact.
@@ -144,10 +141,6 @@ class WarpEffect(Effect):
         if self.has_closed_form and not self.has_kinks and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)
         return plan
-
-    def plan_request(self, height: int, width: int, dtype: torch.dtype) -> PlanRequest:
-        """Return the request of a plan under the tolerance of this effect."""
-        return PlanRequest(height, width, self.tolerance_px, dtype is torch.float64, self.rounding_ulps)
 
     def for_params(self, params: Any, height: int, width: int) -> "WarpEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
@@ -176,18 +169,13 @@ class WarpEffect(Effect):
         params = params_per_frame(params, rows // max(len(params.applied), 1))
         return ParamsAtDepth(params, expand_batch(frame_depth(self.depth, image, depth), rows))
 
-    def active(self, params: Any, height: int, width: int) -> Tensor:
-        """Return (B,), bool: the samples that move."""
-        return params.applied & ~params.is_identity & (height * width > 1)
-
     def warp_flow(self, params: Any, plan: WarpPlan) -> WarpFlow:
         """Return the flow as a function of points."""
-        active = self.active(params, plan.height, plan.width)
-        return WarpFlow(self.flow, params, active, plan, has_closed_form=self.has_closed_form)
+        return WarpFlow(self.flow, params, self.active(params), plan, has_closed_form=self.has_closed_form)
 
     def masked_inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the flow that undoes a masked one (N, 2, H, W), zero for samples that do not move."""
-        active = expand_batch(self.active(params, *flow.shape[2:]), flow.shape[0])
+        active = expand_batch(self.active(params), flow.shape[0])
         inverse, exists = self.inverse_flow(params, flow)
         inverse = expand_batch(inverse, flow.shape[0])
         return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
@@ -213,10 +201,13 @@ class WarpEffect(Effect):
         """Compute the flow by a plan."""
         if plan.stride == 0 and not requires_grad(params):
             return [zero_flow(params, plan)]
+        warp = self.warp_flow(params, plan)
         if plan.is_measured and can_read(params):
-            exact = self.warp_flow(params, plan).exact()
-            return flow_on_measured_lattice([exact], stride=COARSEST, tolerance_px=plan.error_px)
-        return [flow_at_nodes(self.warp_flow(params, plan), lattice_with_stride(plan.height, plan.width, plan.stride))]
+            return flow_on_measured_lattice([warp.exact()], stride=COARSEST, tolerance_px=plan.error_px)
+        lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
+        points = lattice.points(dtype=flow_dtype(params), device=warp.active.device)
+        flow, exists = warp.masked(*self.flow(params, points, plan))
+        return [FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))]
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Sample the images along the flow."""
@@ -227,7 +218,7 @@ class WarpEffect(Effect):
         flow, moments = self.flow_by_plan(params, height, width), self.moments()
         if flow.is_zero and len(moments) == 1:
             return unchanged(image, drawn)
-        active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
+        active = self.active(params)  # a flow has B rows, or as many as there are images
         moves = expand_batch(active, len(image))
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
 
@@ -251,8 +242,8 @@ class WarpEffect(Effect):
 
     @assume_constant_result
     def _constant_share(self, _: int, height: int, width: int, dtype: torch.dtype, share_px: float | None) -> WarpPlan:
-        request = replace(self.plan_request(height, width, dtype), tolerance_px=share_px)
-        return self.plan_under(request if request.is_reachable else replace(request, tolerance_px=None))
+        request = PlanRequest(height, width, share_px, dtype is torch.float64, self.rounding_ulps)
+        return self.plan_under(request.if_reachable())
 
 
 def mean_of_exposures(

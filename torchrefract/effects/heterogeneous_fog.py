@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch, in_ranges
 from torchrefract._validation import (
+    bounded,
     check_choice,
     check_number,
     check_positive,
@@ -411,7 +412,7 @@ class HeterogeneousFog(PhotometricEffect):
     def _wakes(self, vehicles: Tensor, distance: Tensor, image: Tensor) -> Tensor:
         """Compute (N, 1, H, W): the mean density of the dust behind vehicles along each ray."""
         (rows, _, height, width), dtype = image.shape, distance.dtype
-        boxes = finite_or(vehicles.to(dtype), 0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX)
+        boxes = bounded(vehicles.to(dtype), -_FARTHEST_PX, _FARTHEST_PX)
         boxes = boxes.flatten(0, 1) if boxes.ndim == 4 else expand_batch(boxes, rows)
         depth = expand_batch(distance / self._ray_length(distance, image), rows)
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)

@@ -10,13 +10,13 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import expand_batch, in_ranges
 from torchrefract._validation import (
+    bounded,
     check_count,
     check_number,
     check_positive,
     check_range,
     check_within,
     eager_values,
-    finite_or,
     requires_grad,
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
@@ -192,7 +192,7 @@ class PhysicalTurbulence(WarpEffect):
         u = v = torch.zeros((), dtype=dtype, device=depth.device)
         for share, (along_x, along_y) in zip(shares, gradients, strict=True):
             u, v = torch.addcmul(u, share, along_x), torch.addcmul(v, share, along_y)
-        scale = finite_or(air.tilt, 0.0).clamp(-_LARGEST_TILT, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
+        scale = bounded(air.tilt, 0.0, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
         if self.height is not None:
             below = (points.y - (self.horizon * height - 0.5)) / focal[1]
             scale = scale * height_gain(1 - depth * below / self.height, self._layers.gains)
@@ -239,7 +239,7 @@ class PhysicalTurbulence(WarpEffect):
         if not may_move and eager_values((params.frame == 0).all, of=params.frame):
             return None
         frame = frames_of(params).double()[:, None]
-        wind = expand_batch(finite_or(params.wind, 0.0).clamp(-_FASTEST, _FASTEST), len(frame))
+        wind = expand_batch(bounded(params.wind, -_FASTEST, _FASTEST), len(frame))
         return frame / self.fps * wind.double()
 
 

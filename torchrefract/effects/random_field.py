@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import (
+    bounded,
     check_range,
     check_values,
     check_within,
     eager_values,
-    finite_or,
     requires_grad,
     warn,
 )
@@ -66,7 +66,7 @@ def check_frame(params: Any) -> None:
 
 def frames_of(params: Any) -> Tensor:
     """Return (B T,), the numbers of the frames, within the bounds of `check_frame`; a NaN counts as frame 0."""
-    return finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
+    return bounded(params.frame.reshape(-1), -LATEST_FRAME, LATEST_FRAME)
 
 
 def check_field_range(name: str, value: Range) -> Range:
@@ -90,7 +90,7 @@ def motion_of(params: Any) -> Motion:
     wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
     return Motion(
         frames_of(params),
-        finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
+        bounded(wind, -_FASTEST, _FASTEST),
         torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf),
     )
 

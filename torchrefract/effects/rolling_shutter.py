@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number, check_values, check_within, finite_or
+from torchrefract._validation import bounded, check_count, check_number, check_values, check_within, finite_or
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.random_field import check_frame, frames_of
@@ -205,25 +205,17 @@ class RollingShutter(WarpEffect):
         """Return the motion of each frame in SI units, and 1 / depth; values that are not finite move nothing."""
         params: Any
         params, depth, moment = at_depth
-
-        def bounded(name: str, value: Tensor) -> Tensor:
-            # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
-            largest = 2 * _BOUNDS[name][1]
-            return finite_or(value, 0.0).clamp(-largest, largest)
-
-        frequency = bounded("frequency", params.frequency)
+        frequency = bounded(params.frequency, *_BOUNDS["frequency"])
         # Late frames have large phases, of which float32 would lose the digits.
         turns = frequency.double() * (frames_of(params).double()[:, None] / self.fps)
-        phase = (
-            finite_or(params.phase, 0.0) + 2 * math.pi * (turns - turns.detach().floor()).to(frequency.dtype)[:, None]
-        )
-        exposure = bounded("exposure", params.exposure) / 1000
+        turns = (turns - turns.detach().floor()).to(frequency.dtype)[:, None]
+        exposure = bounded(params.exposure, *_BOUNDS["exposure"]) / 1000
         motion = ShutterMotion(
-            speed=bounded("speed", params.speed) / 3.6,
-            readout=bounded("readout", params.readout) / 1000,
+            speed=bounded(params.speed, *_BOUNDS["speed"]) / 3.6,
+            readout=bounded(params.readout, *_BOUNDS["readout"]) / 1000,
             moment=torch.zeros_like(exposure) if moment is None else moment.to(exposure.dtype) * exposure,
-            amplitude=torch.deg2rad(bounded("pitch", params.amplitude)),
+            amplitude=torch.deg2rad(bounded(params.amplitude, *_BOUNDS["pitch"])),
             frequency=frequency,
-            phase=phase,
+            phase=finite_or(params.phase, 0.0) + 2 * math.pi * turns,
         )
         return motion, 1 / depth.to(frequency.dtype).clamp(min=_NEAREST)

@@ -21,8 +21,8 @@ from torchrefract.fields.rolling_shutter import (
 from torchrefract.fields.rolling_shutter_error import RollingShutterErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
-from torchrefract.warping.grid import Points
-from torchrefract.warping.invert import residual_of
+from torchrefract.warping.flow import compose_flows
+from torchrefract.warping.grid import Points, length
 from torchrefract.warping.lattice import pixel_lattice
 
 _BOUNDS: dict[str, Range] = {
@@ -173,7 +173,7 @@ class RollingShutter(WarpEffect):
         points = pixel_lattice(height, width).points(dtype=flow.dtype, device=flow.device)
         view = pinhole_of(self.camera, height=height, width=width)
         inverse, exists = rolling_shutter_restore_flow(motion, inverse_depth, points, view)
-        return inverse, exists & (residual_of(flow, inverse) <= _RESIDUAL_PX)
+        return inverse, exists & (length(compose_flows(flow, inverse)) <= _RESIDUAL_PX)
 
     def error_model(self) -> RollingShutterErrorModel:
         """Return the error bounds of the ranges for the depth of the provider."""

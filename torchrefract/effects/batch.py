@@ -301,16 +301,6 @@ def rows_of_samples(index: Tensor, frames: int) -> Tensor:
     return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()
 
 
-def per_sample(flags: Tensor) -> Tensor:
-    """View (N,) as (N, 1, 1, 1)."""
-    return flags.view(-1, 1, 1, 1)
-
-
-def frame_mean(value: Tensor) -> Tensor:
-    """Return (N, C, 1, 1), the mean of (N, C, H, W) over the frame."""
-    return value.mean(dim=(2, 3), keepdim=True)
-
-
 class _SwapGradient(torch.autograd.Function):
     """Return the first tensor, and pass the gradient to the second."""
 

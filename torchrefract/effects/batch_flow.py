@@ -21,9 +21,9 @@ from torch.utils import _pytree as pytree
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import eager_values, requires_grad
-from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
+from torchrefract.effects.batch import rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
-from torchrefract.warping.grid import Points
+from torchrefract.warping.grid import Points, inside
 from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice, within_reach
 from torchrefract.warping.warp import sample_image
 
@@ -85,12 +85,7 @@ class WarpFlow:
                 nodes = lattice.points(dtype=points.x.dtype, device=points.x.device)
                 self._field = LatticeFlow(self.evaluate(self.params, nodes, self.plan)[0], lattice)
             flow, exists = self._field.at(points), everywhere(self.active.device)
-        return self.masked(flow, exists)
-
-    def masked(self, flow: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the flow, zero for samples that do not move, and where it exists."""
-        active = expand_batch(self.active, len(flow))
-        return where_active(flow, 0.0, active, self.params), exists | ~per_sample(active)
+        return masked_flow(flow, exists, self.active, self.params)
 
     def exact(self) -> "WarpFlow":
         """Return the flow without a tolerance."""
@@ -105,6 +100,12 @@ class WarpFlow:
             nodes = expand_batch(self._field.nodes, len(self.active))[rows]
             selected._field = LatticeFlow(nodes, self._field.lattice)
         return selected
+
+
+def masked_flow(flow: Tensor, exists: Tensor, active: Tensor, params: Any) -> tuple[Tensor, Tensor]:
+    """Return a flow (N, 2, h, w), zero for samples that are not active, (N,) or (B,), and where it exists."""
+    active = expand_batch(active, len(flow))
+    return where_active(flow, 0.0, active, params), exists | ~active.view(-1, 1, 1, 1)
 
 
 class ComposedFlow(NamedTuple):
@@ -296,6 +297,11 @@ class BatchFlow:
         return self._gather(
             [part.exists.expand(len(part.flow.nodes), 1, size.height, size.width) for part in self.parts]
         )
+
+    def leads_inside(self, active: Tensor) -> Tensor:
+        """Return (N, 1, H, W), bool: the flow leads into the frame, or the sample is not active, (N,) or (B,)."""
+        active = expand_batch(active, self.num_rows)
+        return (self.exists & inside(self.dense)) | ~active.view(-1, 1, 1, 1)
 
     def detach(self) -> "BatchFlow":
         """Return the flows without gradients."""

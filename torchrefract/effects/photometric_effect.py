@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
+from torchrefract.effects.batch import rows_of_samples, select_params, where_active
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
 from torchrefract.planning.plan import check_tolerance
 from torchrefract.types import Degraded, Map
@@ -114,7 +114,7 @@ class PhotometricEffect(Effect):
             if eager_values(active.all, of=active) is not True:
                 rows = max(value.shape[0], len(active))
                 unchanged = _UNCHANGED[name]
-                value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
+                value = torch.where(expand_batch(active, rows).view(-1, 1, 1, 1), expand_batch(value, rows), unchanged)
             return value.expand(-1, 1, *image.shape[2:])
 
         is_same = rendered.image is image

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch, to_float
 from torchrefract._validation import check_choice, eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
+from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, where_active
 from torchrefract.effects.batch_flow import (
     COARSEST,
     BatchFlow,
@@ -23,6 +23,7 @@ from torchrefract.effects.batch_flow import (
     everywhere,
     flow_dtype,
     flow_on_measured_lattice,
+    masked_flow,
     zero_flow,
 )
 from torchrefract.fields.depth import frame_depth
@@ -38,7 +39,7 @@ from torchrefract.planning.plan import (
 )
 from torchrefract.types import Degraded, Inverse, Map
 from torchrefract.warping.flow import compose_flows, folding, is_shown_once
-from torchrefract.warping.grid import Points, field_dtype, inside, length
+from torchrefract.warping.grid import Points, field_dtype, length
 from torchrefract.warping.invert import invert_flow
 from torchrefract.warping.lattice import LatticeFlow
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
@@ -175,10 +176,8 @@ class WarpEffect(Effect):
 
     def masked_inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the flow that undoes a masked one (N, 2, H, W), zero for samples that do not move."""
-        active = expand_batch(self.active(params), flow.shape[0])
         inverse, exists = self.inverse_flow(params, flow)
-        inverse = expand_batch(inverse, flow.shape[0])
-        return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
+        return masked_flow(expand_batch(inverse, len(flow)), exists, self.active(params), params)
 
     def must_be_exact(self, params: Any) -> bool:
         """Return True at a map of depth for which no plan of the ranges holds."""
@@ -201,12 +200,12 @@ class WarpEffect(Effect):
         """Compute the flow by a plan."""
         if plan.stride == 0 and not requires_grad(params):
             return [zero_flow(params, plan)]
-        warp = self.warp_flow(params, plan)
         if plan.is_measured and can_read(params):
-            return flow_on_measured_lattice([warp.exact()], stride=COARSEST, tolerance_px=plan.error_px)
+            exact = self.warp_flow(params, plan).exact()
+            return flow_on_measured_lattice([exact], stride=COARSEST, tolerance_px=plan.error_px)
         lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
-        points = lattice.points(dtype=flow_dtype(params), device=warp.active.device)
-        flow, exists = warp.masked(*self.flow(params, points, plan))
+        points = lattice.points(dtype=flow_dtype(params), device=params.applied.device)
+        flow, exists = masked_flow(*self.flow(params, points, plan), self.active(params), params)
         return [FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))]
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
@@ -230,7 +229,7 @@ class WarpEffect(Effect):
             mean_of_exposures(image, len(moments), sampled, moves, params),
             drawn,
             flow=lambda: flow.dense,
-            valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
+            valid=lambda: flow.leads_inside(active),
             inverse=lambda: self.masked_inverse_flow(params, flow.dense),
         )
 
@@ -294,7 +293,7 @@ def warped(
             return good
         is_once = is_shown_once(*_expand_alike(result.flow, result.restore_flow, exists, result.valid))
         is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_once
-        return good & (~per_sample(composed) | is_inverse)
+        return good & (~composed.view(-1, 1, 1, 1) | is_inverse)
 
     return Degraded(
         image,

@@ -123,12 +123,7 @@ class PhotometricEffect(Effect):
 
     def _with_maps(self, image: Tensor, params: Any, map_of: Callable[[str], Tensor]) -> Degraded:
         """Build a result whose maps are computed from their names when they are first read."""
-
-        def lazy_map(name: str) -> Map:
-            return lambda: map_of(name)
-
-        light = {name: lazy_map(name) for name in self.maps}
-        return Degraded(image, params, valid=lazy_map("valid"), light=light)
+        return Degraded(image, params, {name: lambda _, name=name: map_of(name) for name in ("valid", *self.maps)})
 
     def _unchanged(self, image: Tensor, params: Any) -> Degraded:
         def constant(name: str) -> Tensor:

@@ -163,7 +163,8 @@ class Progress:
         everywhere = lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device)  # noqa: E731 - used once
         valid = everywhere if self.valid is None else self.valid
         if not self.has_warps:
-            return Degraded(self.image, params, valid=valid, light=self.light)
+            maps = {"valid": valid, **self.light}
+            return Degraded(self.image, params, {name: lambda _, value=value: value() for name, value in maps.items()})
         return warped(
             self.image,
             params,

@@ -37,7 +37,7 @@ from torchrefract.planning.plan import (
     lattice_with_stride,
     plan_warp,
 )
-from torchrefract.types import Degraded, Inverse, Map
+from torchrefract.types import Degraded, Inverse
 from torchrefract.warping.flow import compose_flows, folding, is_shown_once
 from torchrefract.warping.grid import Points, field_dtype, length
 from torchrefract.warping.invert import invert_flow
@@ -273,7 +273,7 @@ def warped(
     valid: Callable[[], Tensor],
     inverse: Callable[[], tuple[Tensor, Tensor]],
     is_composed: Callable[[], Tensor] | None = None,
-    light: Mapping[str, Map] | None = None,
+    light: Mapping[str, Callable[[], Tensor]] | None = None,
 ) -> Degraded:
     """Build the result of an effect with a flow; its maps are computed when they are first read.
 
@@ -286,7 +286,8 @@ def warped(
         light: photometric maps by name.
     """
 
-    def restore_valid(result: Degraded, exists: Tensor) -> Tensor:
+    def restore_valid(result: Degraded) -> Tensor:
+        exists = result.inverse.valid
         good = exists & sees_only_valid(*_expand_alike(result.valid, result.restore_flow))
         composed = None if is_composed is None else is_composed()
         if composed is None or eager_values(composed.any, of=composed) is False:
@@ -295,16 +296,16 @@ def warped(
         is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_once
         return good & (~composed.view(-1, 1, 1, 1) | is_inverse)
 
+    maps: dict[str, Callable[[Degraded], Any]] = {
+        "valid": lambda _: valid(),
+        "flow": lambda _: flow(),
+        "restore_flow": lambda _: Inverse(*inverse()),
+        "restore_valid": restore_valid,
+        "restore_residual": lambda result: length(compose_flows(result.flow, result.restore_flow)),
+        "folding": lambda result: folding(result.flow, result.valid),
+    }
     return Degraded(
-        image,
-        params,
-        valid=valid,
-        flow=flow,
-        restore=lambda _: Inverse(*inverse()),
-        restore_valid=restore_valid,
-        residual=lambda result: length(compose_flows(result.flow, result.restore_flow)),
-        folding=lambda result: folding(result.flow, result.valid),
-        light=light,
+        image, params, maps | {name: lambda _, value=value: value() for name, value in (light or {}).items()}
     )
 
 
@@ -313,16 +314,15 @@ def unchanged(image: Tensor, params: Any) -> Degraded:
     size = (image.shape[0], 1, *image.shape[2:])
     everywhere = torch.ones(size, dtype=torch.bool, device=image.device)
     zero = torch.zeros(size, dtype=field_dtype(image.dtype), device=image.device).expand(-1, 2, -1, -1)
-    return Degraded(
-        image,
-        params,
-        valid=lambda: everywhere,
-        flow=lambda: zero,
-        restore=lambda _: Inverse(zero, everywhere),
-        restore_valid=lambda _, exists: exists,
-        residual=lambda _: zero[:, :1],
-        folding=lambda _: folding(zero),
-    )
+    maps: dict[str, Callable[[Degraded], Any]] = {
+        "valid": lambda _: everywhere,
+        "flow": lambda _: zero,
+        "restore_flow": lambda _: Inverse(zero, everywhere),
+        "restore_valid": lambda _: everywhere,
+        "restore_residual": lambda _: zero[:, :1],
+        "folding": lambda _: folding(zero),
+    }
+    return Degraded(image, params, maps)
 
 
 def _expand_alike(*values: Tensor) -> list[Tensor]:

@@ -276,11 +276,6 @@ class BatchFlow:
         return sum(len(part.flow.nodes) for part in self.parts)
 
     @property
-    def is_zero(self) -> bool:
-        """Return True if no flow was computed, because none exceeds the tolerance."""
-        return all(part.is_zero for part in self.parts)
-
-    @property
     def dense(self) -> Tensor:
         """Return (N, 2, H, W), px."""
         # torch.compile cannot trace the lock of functools.cached_property.
@@ -315,27 +310,25 @@ class BatchFlow:
             params: with `applied`; the gradient of applied samples is kept at strength zero.
             options: all decided.
         """
-        chosen = options._asdict()
-        if requires_grad([part.flow.nodes for part in self.parts]):
-            # Samples that do not move need the gradient of their parameters.
-            return where_active(self._sample(image, None, chosen), image, active, params)
-        return self._sample(image, None if eager_values(active.all, of=active) else active, chosen)
+        # Samples that do not move need the gradient of their parameters.
+        has_gradient = requires_grad([part.flow.nodes for part in self.parts])
+        mask = None if has_gradient or eager_values(active.all, of=active) else active
 
-    def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
+        def sampled(part: Tensor, flow: LatticeFlow, mask: Tensor | None) -> Tensor:
+            each = LatticeFlow(expand_batch(flow.nodes, len(part)), flow.lattice)
+            return sample_image(part, each, active=mask, **options._asdict())
+
         if len(self.parts) == 1:
-            flow = self.parts[0].flow
-            flow = LatticeFlow(expand_batch(flow.nodes, image.shape[0]), flow.lattice)
-            return sample_image(image, flow, active=active, **options)
-        result = torch.empty_like(image)
-        frames = image.shape[0] // self.num_rows
-        for index, flow, *_ in self.parts:
-            assert index is not None  # of several parts
-            rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
-            each = LatticeFlow(expand_batch(flow.nodes, len(rows)), flow.lattice)
-            part = sample_image(image[rows], each, active=None if active is None else active[rows], **options)
-            # Forward-mode gradients cannot be written into a tensor without any.
-            result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
-        return result
+            result = sampled(image, self.parts[0].flow, mask)
+        else:
+            result = torch.empty_like(image)
+            for index, flow, *_ in self.parts:
+                assert index is not None  # of several parts
+                rows = rows_of_samples(index, len(image) // self.num_rows * len(flow.nodes) // len(index))
+                part = sampled(image[rows], flow, None if mask is None else mask[rows])
+                # Forward-mode gradients cannot be written into a tensor without any.
+                result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
+        return where_active(result, image, active, params) if has_gradient else result
 
     def _gather(self, values: Sequence[Tensor]) -> Tensor:
         if len(values) == 1:

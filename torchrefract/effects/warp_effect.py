@@ -215,7 +215,7 @@ class WarpEffect(Effect):
             return unchanged(image, params)
         drawn, params = params, self.at_depth(params, image, depth)
         flow, moments = self.flow_by_plan(params, height, width), self.moments()
-        if flow.is_zero and len(moments) == 1:
+        if flow.parts[0].is_zero and len(moments) == 1:
             return unchanged(image, drawn)
         active = self.active(params)  # a flow has B rows, or as many as there are images
         moves = expand_batch(active, len(image))

@@ -1,7 +1,6 @@
 """The flow that shows frames of a camera of any model as a pinhole would have taken them, and the flow back."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -163,7 +162,6 @@ class RectificationErrorModel:
         return ((values - numbers).abs() <= _CLOSE * numbers.abs()).all()
 
 
-@lru_cache(maxsize=64)
 def _measure(camera: Camera) -> FlowBounds | None:
     for num_levels in (5, 3, 2, 1):
         lines = cell_lines(camera.height, camera.width, num_levels)

@@ -277,7 +277,10 @@ def _like(values: Tensor, image: Tensor) -> Tensor:
 
 
 def _chosen(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation: str, is_lattice: bool) -> Any:
-    """Return the module of a backend that samples the image, or None; raise if the caller chose it and it cannot."""
+    """Return the module of a backend that samples the image, or None; raise if the caller chose it and it cannot.
+
+    The flow is of the `sampling_dtype` of the image.
+    """
     if backend not in ("auto", name) or requires_grad((image, flow)):
         return None
     if backend == "auto" and (name == "triton") != image.is_cuda:
@@ -289,7 +292,7 @@ def _chosen(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolati
         why = f"{interpolation} interpolation"
     elif not is_lattice and name == "triton":
         why = "a dense flow"
-    elif sampling_dtype(image, flow.dtype) is torch.float64:
+    elif flow.dtype is torch.float64:
         why = f"{str(image.dtype).removeprefix('torch.')} of {tuple(image.shape[2:])} px, which needs float64"
     elif name == "numba":
         why = why_not_eager(image) or why_not_eager(flow)

@@ -37,8 +37,9 @@ from torchrefract.effects.batch import (
     params_at_frames,
     promote_params,
     to_batch,
+    uses_boxes,
+    with_vehicles,
 )
-from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.fields.depth import DepthSource, depth_of
 from torchrefract.labels.plain_values import name_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like

@@ -28,7 +28,7 @@ from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import lens_flow, lens_restore_flow, misses_in_frame, newton_lens_flow
 from torchrefract.fields.lens_error import LensErrorModel, LensRanges
-from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
+from torchrefract.fields.lens_source import LensSource, camera_with_covariance, lenses_from_cameras, ranges_around
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
@@ -173,7 +173,7 @@ class LensDistortion(WarpEffect):
         """
         warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p, "frame": frame}
         if covariance is None:
-            ranges = jittered_camera(camera, jitter=jitter, residual_px=residual_px).ranges
+            ranges = ranges_around(camera, jitter=jitter, residual_px=residual_px)
             return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
         if jitter:
             raise ValueError(f"jitter must be 0 if a covariance is given, got {jitter}")

@@ -16,13 +16,11 @@ from torchrefract._validation import (
     check_positive,
     check_range,
     check_within,
-    eager_values,
-    requires_grad,
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
-from torchrefract.effects.random_field import check_frame, frames_of
+from torchrefract.effects.random_field import check_frame, frames_of, is_still
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.physical_turbulence import (
@@ -235,8 +233,7 @@ class PhysicalTurbulence(WarpEffect):
 
     def _shift(self, params: PhysicalTurbulenceParams) -> Tensor | None:
         """Return (N, 2), m: how far the wind has moved the air, or None if it has not."""
-        may_move = params.frame.shape[1] > 1 or requires_grad((params.frame, params.wind))
-        if not may_move and eager_values((params.frame == 0).all, of=params.frame):
+        if is_still(params.frame, params.wind):
             return None
         frame = frames_of(params).double()[:, None]
         wind = expand_batch(bounded(params.wind, -_FASTEST, _FASTEST), len(frame))

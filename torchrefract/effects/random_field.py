@@ -99,16 +99,15 @@ def field_params(params: Any) -> FieldParams:
     """Return sizes, noise and motion of each frame, N = B T rows."""
     rows = params.frame.numel()
     aperture = expand_batch(params.aperture, rows) if "aperture" in params._fields else None
-    motion = None if _is_still(params) else motion_of(params)
+    motion = None if is_still(params.frame, params.wind, params.decorrelation) else motion_of(params)
     return FieldParams(expand_batch(params.length, rows), aperture, expand_batch(params.key, rows), motion)
 
 
-def _is_still(params: Any) -> bool:
+def is_still(frame: Tensor, *motion: Tensor) -> bool:
     """Return True if all samples are at frame 0 and no gradient of time is needed, as far as values can be read."""
-    moving = (params.frame, params.wind, params.decorrelation)
-    if params.frame.shape[1] > 1 or requires_grad(moving):
+    if frame.shape[1] > 1 or requires_grad((frame, *motion)):
         return False
-    return eager_values((params.frame == 0).all, of=params.frame) is True
+    return eager_values((frame == 0).all, of=frame) is True
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

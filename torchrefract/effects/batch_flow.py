@@ -24,7 +24,7 @@ from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.batch import rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
 from torchrefract.warping.grid import Points, inside
-from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice, within_reach
+from torchrefract.warping.lattice import LatticeFlow, lattice_around, lattice_with_stride, pixel_lattice, within_reach
 from torchrefract.warping.warp import sample_image
 
 COARSEST = 64  # px, stride of the first lattice that is measured
@@ -156,7 +156,7 @@ def flow_on_measured_lattice(
     height, width = warps[0].plan.height, warps[0].plan.width
     while stride > max(1, min(height, width) // _FEWEST_CELLS):
         stride //= 2
-    lattice = pixel_lattice(height, width) if stride == 1 else Lattice(height, width, stride, _MARGIN)
+    lattice = lattice_with_stride(height, width, stride, margin=_MARGIN)
     composed = compose_at(warps, lattice.points(dtype=flow_dtype(warps[0].params), device=warps[0].active.device))
     if stride == 1:
         return [FlowPart(None, LatticeFlow(composed.flow, lattice), composed.exists)]

@@ -34,14 +34,13 @@ from torchrefract.planning.plan import (
     PlanRequest,
     WarpPlan,
     check_tolerance,
-    lattice_with_stride,
     plan_warp,
 )
 from torchrefract.types import Degraded, Inverse
 from torchrefract.warping.flow import compose_flows, folding, is_shown_once
 from torchrefract.warping.grid import Points, field_dtype, length
 from torchrefract.warping.invert import invert_flow
-from torchrefract.warping.lattice import LatticeFlow
+from torchrefract.warping.lattice import LatticeFlow, lattice_with_stride
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
 
 # Of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more.

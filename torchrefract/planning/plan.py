@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrefract._tensor import cached_constant
 from torchrefract._validation import check_number
 from torchrefract.types import FlowBounds, Simplification
-from torchrefract.warping.lattice import Lattice
 
 TOLERANCE_PX = 0.02  # the default of all warps; an error of this size is invisible
 EXACT_AT_NODES = "exact, at the nodes of the composed flow"  # the reason of warps in closed form
@@ -213,11 +212,6 @@ def coarsest_stride(bounds: FlowBounds, simplified: Simplification, budget_px: f
     # The error grows with the stride: only strides below the first one that does not fit count.
     count = np.logical_and.accumulate(total <= budget_px).sum()
     return STRIDES[count - 1] if count else 1
-
-
-def lattice_with_stride(height: int, width: int, stride: int) -> Lattice:
-    """Return the pixels for strides of 0 and 1, otherwise a lattice with one node more on each side."""
-    return Lattice(height, width, stride, 1) if stride > 1 else Lattice(height, width, 1, 0)
 
 
 def check_tolerance(value: float | None, *, name: str = "tolerance_px") -> float | None:

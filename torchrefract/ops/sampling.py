@@ -12,9 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import (
-    as_device_tensor,
     assume_constant_result,
-    cached_constant,
     exact_matmul,
     has_memory_format,
     is_channels_last,
@@ -175,7 +173,8 @@ def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -
     Returns:
         (stride, 4).
     """
-    return as_device_tensor(_constant_weights(stride), dtype=dtype, device=device)
+    t = torch.arange(stride, dtype=torch.float64, device=device) / stride
+    return torch.stack(lagrange_basis(t), dim=1).to(dtype)
 
 
 def lagrange_basis(t: Any) -> list[Any]:
@@ -212,17 +211,6 @@ def interpolate_nodes(nodes: Tensor, *, stride: int, margin: int, height: int, w
         lines = exact_matmul(nodes.unfold(3, 4, 1), weights.mT).flatten(3)[..., :width]
         # One product a cell: with a matrix on the left, matmul would copy the lines to fold them into one matrix.
         return exact_matmul(weights[None], lines.unfold(2, 4, 1).mT).flatten(2, 3)[:, :, :height]
-
-
-@assume_constant_result
-def _constant_weights(stride: int) -> list[list[float]]:
-    return _cached_weights(stride)  # called indirectly, since torch.compile warns of caches that it traces
-
-
-@cached_constant(maxsize=64)
-def _cached_weights(stride: int) -> list[list[float]]:
-    t = torch.arange(stride, dtype=torch.float64, device="cpu") / stride
-    return torch.stack(lagrange_basis(t), dim=1).tolist()
 
 
 def _num_parts(source: Tensor, pixels: int) -> int:

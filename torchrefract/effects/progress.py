@@ -35,6 +35,7 @@ class Leaf(NamedTuple):
     effect: Any  # a `WarpEffect` or a `PhotometricEffect`
     params: Any
     options: SamplingOptions  # first those of the compositions around it
+    place: int  # among all effects that are not compositions, in order
 
 
 class _Segment(NamedTuple):

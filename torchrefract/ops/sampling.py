@@ -39,8 +39,10 @@ _SUPPORTED = {
 
 def sample(
     image: Tensor,
-    flow: Tensor,
+    nodes: Tensor,
     *,
+    stride: int = 1,
+    margin: int = 0,
     padding: str,
     interpolation: str,
     backend: str = "auto",
@@ -50,7 +52,11 @@ def sample(
 
     Args:
         image: (N, C, H, W), of any real type. Integers are rounded and clamped, half types are sampled in float32.
-        flow: (N or 1, 2, H, W), px. NaN and infinity count as a position outside.
+        nodes: (N or 1, 2, h, w), px, the flow at the nodes of a lattice, with cubics between them; by default at the
+            pixels. Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride. NaN and infinity count as a
+            position outside.
+        stride: px, between nodes.
+        margin: nodes before the first pixel, at least 1, or 0 with stride 1.
         padding: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic", which is clamped to the range of the image's values.
         backend: "torch", "numba", "triton", or "auto" for the fastest one that supports the arguments. Where a
@@ -65,65 +71,30 @@ def sample(
     """
     if image.numel() == 0:
         return image.clone()
-    dtype = sampling_dtype(image, flow.dtype)
-    flow = flow.to(dtype)
-    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": False}
-    numba = _chosen("numba", image, flow, **choice)
-    if numba is not None:
-        source = image if image.dtype is torch.uint8 else image.to(dtype)
-        options = {"margin": 0, "padding": padding, "limit": DENSE_LIMIT, "active": active}
-        return _like(numba.sample_lattice(source, flow, None, **options), image)
-    _chosen("triton", image, flow, **choice)  # raises if the caller chose it
-    return _by_torch(image, sampler_grid(flow), dtype, padding=padding, interpolation=interpolation, active=active)
-
-
-def sample_lattice(
-    image: Tensor,
-    nodes: Tensor,
-    *,
-    stride: int,
-    margin: int,
-    padding: str,
-    interpolation: str,
-    backend: str = "auto",
-    active: Tensor | None = None,
-) -> Tensor:
-    """Sample an image at p + flow(p), for a flow at the nodes of a lattice with cubics between them.
-
-    Args:
-        image: (N, C, H, W), as for `sample`.
-        nodes: (N or 1, 2, h, w), px. Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride.
-        stride: px, between nodes.
-        margin: nodes before the first pixel, at least 1, or 0 with stride 1.
-        padding, interpolation, backend, active: as for `sample`.
-
-    Returns:
-        (N, C, H, W), of the type and the memory format of the image.
-
-    Raises:
-        ValueError: the backend does not support the arguments.
-    """
     height, width = image.shape[2:]
-    lattice = {"stride": stride, "margin": margin}
-    if image.numel() == 0 or stride == 1:
-        flow = interpolate_nodes(nodes, **lattice, height=height, width=width)
-        return sample(image, flow, padding=padding, interpolation=interpolation, backend=backend, active=active)
+    lattice = {"stride": stride, "margin": margin, "height": height, "width": width}
+    if stride == 1:
+        nodes, margin = interpolate_nodes(nodes, **lattice), 0
     dtype = sampling_dtype(image, nodes.dtype)
-    nodes, limit = nodes.to(dtype), LATTICE_LIMIT
-    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": True}
+    nodes, limit = nodes.to(dtype), LATTICE_LIMIT if stride > 1 else DENSE_LIMIT
     fast = backend if backend in _MODULES else "triton" if image.is_cuda else "numba"
+    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": stride > 1}
     module = _chosen(fast, image, nodes, **choice)
     if module is not None:
         source = image if fast == "numba" and image.dtype is torch.uint8 else image.to(dtype)
-        weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
+        weights = None
+        if stride > 1:
+            weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
+            nodes = _finite(nodes, limit * max(height, width))
         options = {"margin": margin, "padding": padding, "limit": limit, "active": active}
-        nodes = _finite(nodes, limit * max(height, width))
         return _like(module.sample_lattice(source, nodes, weights, **options), image)
-    # The positions of the pixels are linear, so the cubics keep them when they are added at the nodes.
-    start = -margin * stride
-    y, x = (start + stride * torch.arange(n, dtype=dtype, device=nodes.device) for n in nodes.shape[2:])
-    positions = _finite(_to_sampler(nodes, x, y[:, None], height=height, width=width), limit)
-    grid = interpolate_nodes(positions, **lattice, height=height, width=width).movedim(1, -1)
+    if stride == 1:
+        grid = sampler_grid(nodes)
+    else:
+        # The positions of the pixels are linear, so the cubics keep them when they are added at the nodes.
+        y, x = (stride * (torch.arange(n, dtype=dtype, device=nodes.device) - margin) for n in nodes.shape[2:])
+        positions = _finite(_to_sampler(nodes, x, y[:, None], height=height, width=width), limit)
+        grid = interpolate_nodes(positions, **lattice).movedim(1, -1)
     return _by_torch(image, grid, dtype, padding=padding, interpolation=interpolation, active=active)
 
 

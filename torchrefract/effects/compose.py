@@ -247,15 +247,16 @@ class Compose(Effect):
         """
         placed: list[Leaf] = []
         for leaf in leaves:
-            effect, depth = leaf.effect, progress.depth
             params = params_per_frame(leaf.params, progress.frames)
-            if placed and depth is not None and effect.depth is not None:
-                active = [before.effect.active(before.params) for before in placed]
-                parts = self._parts(placed, active, request, can_measure=False)
-                depth = progress.moved_depth(placed, active, parts)
-            elif depth is None:
-                depth = progress.depth_for(effect)
-            placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
+            if leaf.effect.depth is not None:
+                depth = progress.depth_for(leaf.effect)
+                if placed and progress.depth is not None:
+                    active = [before.effect.active(before.params) for before in placed]
+                    depth = progress.moved_depth(
+                        placed, active, self._parts(placed, active, request, can_measure=False)
+                    )
+                params = leaf.effect.at_depth(params, progress.image, depth)
+            placed.append(leaf._replace(params=params))
         return placed
 
     @assume_constant_result

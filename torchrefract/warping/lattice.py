@@ -140,7 +140,7 @@ def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
 def _cells(index: Tensor, count: int, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
     """Return the first of the four nodes around each fractional index, int64, and the weights of the four."""
     second = index.detach().clamp(1, count - 3).long()
-    return second - 1, [weight.to(dtype) for weight in lagrange_basis(index - second)]
+    return second - 1, lagrange_basis((index - second).to(dtype))
 
 
 def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -127,6 +127,17 @@ class Robustness:
     worst_case: dict[Level, np.ndarray] = field(default_factory=dict)
     worst_seeds: dict[Level, np.ndarray] = field(default_factory=dict)
 
+    @property
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes."""
+        return list(dict.fromkeys(level.scene for level in self.scores))
+
+    def scenes_or_all(self, scene: str | None) -> list[str]:
+        """Return one scene, or all for None; raise ValueError for a scene that was not scored."""
+        if scene is not None and scene not in self.scenes:
+            raise ValueError(f"scene must be one of {', '.join(self.scenes)}, got {scene}")
+        return self.scenes if scene is None else [scene]
+
     def rows(self) -> list[Row]:
         """Return the scores by level, with 95 % intervals by resampling of the images."""
         rows = []
@@ -178,13 +189,10 @@ class Robustness:
 
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
-        scenes = list(dict.fromkeys(level.scene for level in self.scores))
-        if scene is not None and scene not in scenes:
-            raise ValueError(f"scene must be one of {', '.join(scenes)}, got {scene}")
+        scenes = self.scenes_or_all(scene)
         names = ["score", *(["worst_case"] if self.worst_case else []), *self.set_scores.get(None, ())]
         if of not in names:
             raise ValueError(f"of must be one of {', '.join(names)}, got {of}")
-        scenes = scenes if scene is None else [scene]
         means = [np.mean([self._value(of, level) for level in self.scores if level.scene == s]) for s in scenes]
         return float(np.mean(means))
 
@@ -411,9 +419,7 @@ def _collect(
         scores={level: np.array([of.score for of in of_level[level]]) for level in levels},
         values={level: np.array([of.value for of in of_level[level]]) for level in levels if level.scene in quantities},
         set_scores={level: set_scores([of.summary for of in images]) for level, images in of_level.items()},
-        quantities={
-            scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
-        },
+        quantities={level.scene: quantities[level.scene] for level in levels if level.scene in quantities},
         failures=dict(failures),
         worst_case={level: np.array([of.worst_case for of in of_level[level]]) for level in searched},
         worst_seeds={level: np.array([of.worst_seed for of in of_level[level]]) for level in searched},

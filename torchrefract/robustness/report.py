@@ -190,11 +190,10 @@ def _flat(row: Row) -> dict[str, Any]:
 
 def _worst_cases(result: Robustness) -> dict[str, dict[str, float]]:
     """Return the mean score and the mean worst case of each scene, and of all."""
-    scenes = list(dict.fromkeys(level.scene for level in result.worst_case))
     kinds = {"mean_performance": "score", "worst_case": "worst_case"}
     return {
         scene or "all scenes": {name: result.mean_performance(scene, of=of) for name, of in kinds.items()}
-        for scene in [*scenes, None]
+        for scene in [*result.scenes, None]
     }
 
 
@@ -211,10 +210,9 @@ def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
     """Draw the score, with intervals, or one of all images together."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
-    scenes = list(dict.fromkeys(level.scene for level in result.scores))
-    for i, scene in enumerate(scenes):
+    for i, scene in enumerate(result.scenes):
         of_scene = [row for row in rows if row.scene == scene]
-        shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
+        shift = _SPACING * (i - (len(result.scenes) - 1) / 2)  # so that equal scores do not hide one another
         x = [row.severity + shift for row in of_scene]
         if of == "score":
             y = np.array([row.score for row in of_scene])
@@ -238,7 +236,7 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
         text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
         value, _, interval = text.partition("[")
         cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
-    others = dict.fromkeys(level.scene for level in result.scores if level.scene not in result.quantities)
+    others = [scene for scene in result.scenes if scene not in result.quantities]
     return cells + [(scene, "", "", "none, see the scores by severity") for scene in others]
 
 

@@ -12,14 +12,14 @@ import argparse
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from statistics import median
 
 import torch
 from severity import frames_in
-from timing import Bar, count, size
+from timing import Bar, count, seconds, size
 from torch import Tensor
 from torchvision import models
 
@@ -35,6 +35,7 @@ from torchrefract.robustness.scores import as_labels
 
 LIMIT = 1.2  # of the time of the evaluation over that of the model
 MODELS = ("opencv:hog", "torchvision:ssdlite320_mobilenet_v3_large", "torchvision:fasterrcnn_resnet50_fpn")
+cpu_seconds = partial(seconds, clock=time.process_time)
 _ONE_BOX = {"boxes": torch.tensor([[0.0, 0, 9, 9]]), "labels": torch.ones(1).long(), "scores": torch.ones(1)}
 SCENES = [name for name in QUANTITIES if name != "night_fog"]  # of frames by day
 
@@ -56,7 +57,7 @@ def main() -> None:
     )
     print("CPU ms for a picture, by severity")
     for name, costs in scene_costs(frames).items():
-        print(f"{name:20}", *(f"{1e3 * seconds:6.1f}" for seconds in costs.values()))
+        print(f"{name:20}", *(f"{1e3 * cost:6.1f}" for cost in costs.values()))
     for model in args.models:
         bare, evaluation = model_cost(load(model), frames)
         print(f"\n{model}: {bare:.2f} s alone, {evaluation:.2f} s in the evaluation of a frame")
@@ -110,13 +111,6 @@ def model_cost(predict: Predict, frames: Sequence[Tensor]) -> tuple[float, float
     evaluation = cpu_seconds(lambda: evaluate(recorded, samples, by_name, choose_score, **options))
     bare = cpu_seconds(lambda: [predict(picture) for picture in pictures])
     return bare / len(frames), evaluation / len(frames)
-
-
-def cpu_seconds(call: Callable[[], object]) -> float:
-    """Return the seconds of the CPU that a call takes."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start
 
 
 if __name__ == "__main__":

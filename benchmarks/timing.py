@@ -291,6 +291,11 @@ def table(timings: Sequence[Timing], conditions: Conditions | None = None) -> st
     return "\n".join([*([] if conditions is None else [_describe(conditions), ""]), lines[0], rule, *lines[1:]])
 
 
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Format rows of cells as a table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
 def save(
     path: Path,
     timings: Sequence[Timing],

@@ -177,11 +177,8 @@ def _lensfun_camera(
         raise ValueError(f"width and height must be those of the frames, which {path} does not hold, got None")
     check_count("width", width)
     check_count("height", height)
-    kind = lens.findtext("type") or "rectilinear"
-    if kind not in _LENSFUN_TYPES:
-        raise ValueError(
-            f"path must hold a rectilinear or fisheye lens, got {path} with the type {kind}{_NO_EXACT_LENS}"
-        )
+    kind = Document(path, {"type": lens.findtext("type") or "rectilinear"})
+    model = kind.choice("type", _LENSFUN_TYPES, remedy=_NO_EXACT_LENS)
     for element in ("center", "fov", "field-of-view"):
         if lens.find(f".//{element}") is not None:
             raise ValueError(f"path must hold a lens without {element}, got {path} with it{_NO_EXACT_LENS}")
@@ -200,22 +197,16 @@ def _lensfun_camera(
     center_factor, k1, k2 = _lensfun_terms(path, distortion)
     if not center_factor > 0:
         raise ValueError(f"path must hold a distortion that grows at the center, got {path} with {center_factor:g}")
-    real = distortion.get("real-focal") or next(
-        (
-            element.get("real-focal")
-            for element in calibration.findall("real-focal-length")
-            if math.isclose(_positive(path, "focal", element.get("focal")), focal)
-        ),
-        None,
-    )
-    real_mm = _positive(path, "real-focal", real) if real is not None else focal * center_factor
+    measured = [distortion, *calibration.findall("real-focal-length")]
+    real = [m.get("real-focal") for m in measured if math.isclose(_positive(path, "focal", m.get("focal")), focal)]
+    real_mm = next((_positive(path, "real-focal", text) for text in real if text), focal * center_factor)
     half_height_mm = _FILM_DIAGONAL_MM / calibrated_crop / math.hypot(aspect, 1) / 2
     scale = real_mm / half_height_mm / center_factor  # of r_u, from focal lengths
     square = scale * scale
     coefficients = (k1 * square / center_factor, k2 * square * square / center_factor, 0.0, 0.0)
     pixel_mm = _FILM_DIAGONAL_MM / crop_factor / math.hypot(width, height)
     pinhole = (real_mm / pixel_mm, real_mm / pixel_mm, (width - 1) / 2, (height - 1) / 2)
-    return Document(path, {}).camera((width, height), pinhole, coefficients, _LENSFUN_TYPES[kind])
+    return Document(path, {}).camera((width, height), pinhole, coefficients, model)
 
 
 def _choose_distortion(

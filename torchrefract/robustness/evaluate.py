@@ -267,38 +267,41 @@ def evaluate(
     batch_size = check_count("batch_size", batch_size)
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
-    for name, image, given in samples:
-        _check_sample(name, image, scored, failures)
-        if name in done:
-            scored[name] = _checked_done(name, done[name], num_draws)
-            continue
-        if given is None and as_target is None:
+
+    def score_image(name: str, image: Tensor, target: Any) -> Scored:
+        if target is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
         by_name = _checked_scenes(
             scenes(image.shape[-1]) if callable(scenes) and not isinstance(scenes, Effect) else scenes
         )
+        (prediction,) = _predict(predict, [image])
+        if target is None and as_target is not None:
+            target = as_target(prediction, (image.shape[-2], image.shape[-1]))
+        clean = _score(score, prediction, target)
+        draws: dict[Level, list[ImageScore]] = {}
+        options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
+        with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
+            while batch := list(itertools.islice(pictures, batch_size)):
+                predictions = _predict(predict, [degraded.image for _, degraded, _ in batch])
+                for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
+                    quantity = quantities.get(level.scene)
+                    value = quantity.get(degraded.params).item() if quantity else 0.0
+                    draws.setdefault(level, []).append(_score(score, prediction, moved, value))
+        return Scored(clean, {level: _with_worst_case(of, seed) for level, of in draws.items()})
+
+    for name, image, target in samples:
+        _check_sample(name, image, scored, failures)
+        if name in done:
+            if num_draws > 1 and any(of.worst_case is None for of in done[name].levels.values()):
+                raise ValueError(f"done must have worst cases, got none for {name}; score it again")
+            scored[name] = done[name]
+            continue
         try:
-            (prediction,) = _predict(predict, [image])
-            target = given
-            if given is None and as_target is not None:
-                target = as_target(prediction, (image.shape[-2], image.shape[-1]))
-            clean = _score(score, prediction, target)
-            draws: dict[Level, list[ImageScore]] = {}
-            options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
-                while batch := list(itertools.islice(pictures, batch_size)):
-                    predictions = _predict(predict, [degraded.image for _, degraded, _ in batch])
-                    for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
-                        quantity = quantities.get(level.scene)
-                        value = quantity.get(degraded.params).item() if quantity else 0.0
-                        draws.setdefault(level, []).append(_score(score, prediction, moved, value))
-            by_level = {level: _with_worst_case(of, seed) for level, of in draws.items()}
-        except _PredictionError as error:
-            failures[name] = str(error)
-        else:
-            scored[name] = Scored(clean, by_level)
+            scored[name] = score_image(name, image, target)
             if on_scored is not None:
                 on_scored(name, scored[name])
+        except _PredictionError as error:
+            failures[name] = str(error)
         if _fails_too_often(len(failures), len(scored)):
             break
     if not scored or _fails_too_often(len(failures), len(scored)):
@@ -332,13 +335,6 @@ def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
     if not isinstance(image, Tensor) or image.ndim != 3:
         got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
         raise ValueError(f"samples must have images (3, H, W), tensors, got {got} for {name}")
-
-
-def _checked_done(name: str, scored: Scored, num_draws: int) -> Scored:
-    """Return the scores of an image; raise ValueError if they lack worst cases."""
-    if num_draws > 1 and any(of.worst_case is None for of in scored.levels.values()):
-        raise ValueError(f"done must have worst cases, got none for {name}; score it again")
-    return scored
 
 
 def _checked_scenes(scenes: Any) -> Scenes:

@@ -25,8 +25,8 @@ from omegaconf import OmegaConf
 from pytorch_lightning import Callback, LightningModule, Trainer, seed_everything
 from timing import RESULTS, count, markdown, size, write_json
 
+from torchrefract._io import write_figure
 from torchrefract.data.module import PairData
-from torchrefract.restoration.report import save_figure
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 _SMALL = ("model.network.widths=[32,64,128,128]", "model.lr=0.001", "model.warmup_steps=50", "model.crop=null")
@@ -108,7 +108,7 @@ def main() -> None:
             write_json(files[name], learn(name, data, args))
     curves = {name: json.loads(file.read_text()) for name, file in files.items()}
     print(table(curves, kind))
-    save_figure(plot(curves, kind), args.out / f"{args.task}.png")
+    write_figure(args.out / f"{args.task}.png", plot(curves, kind))
 
 
 def learn(name: str, data: PairData, args: argparse.Namespace) -> list[Point]:

@@ -1,6 +1,5 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
-import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_figure
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
@@ -74,10 +73,7 @@ def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, 
         with naming(name):
             rows.append(contact_sheet_row(name, effect, frame=frame, depth=depth, seed=seed))
     height, width = frame.shape[2:]
-    sheet = io.BytesIO()  # matplotlib's errors of a full disk would not say so
-    figure = contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}")
-    figure.savefig(sheet, format=path.suffix[1:])
-    path.write_bytes(sheet.getvalue())
+    write_figure(path, contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}"))
 
 
 def _effects(cfg: DictConfig) -> dict[str, Effect]:

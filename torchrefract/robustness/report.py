@@ -1,7 +1,6 @@
 """The report of a robustness test: tables of numbers, and one HTML file that opens anywhere."""
 
 import base64
-import csv
 import html
 import io
 import json
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from torchrefract._io import replace_file, write_file
+from torchrefract._io import write_csv, write_file
 from torchrefract.data.images import pixels_of
 from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
@@ -75,10 +74,7 @@ def write_tables(
         comparison: the errors relative to those of a base, or None.
     """
     rows = [_flat(row) for row in result.rows()]
-    with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*dict.fromkeys(name for row in rows for name in row), *_OF_RUN])
-        writer.writeheader()
-        writer.writerows(row | {name: about[name] for name in _OF_RUN} for row in rows)
+    write_csv(out / "results.csv", [row | {name: about[name] for name in _OF_RUN} for row in rows])
     summary = {
         "about": about,
         "clean": result.clean_estimate()._asdict(),

@@ -240,7 +240,7 @@ def _ranked(ratios: Mapping[str, float]) -> str:
 
 def make_camera(height: int, width: int) -> tr.Camera:
     """Return the camera of the task "lens"."""
-    pinhole = {"fx": FOCAL * width, "fy": FOCAL * width, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    pinhole: dict[str, Any] = {"fx": FOCAL * width, "fy": FOCAL * width, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
     return tr.Camera(width=width, height=height, **pinhole, coefficients=(K1, K2, P, P, 0.0))
 
 

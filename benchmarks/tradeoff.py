@@ -28,6 +28,7 @@ from timing import (
     GRID_SAMPLE,
     PHOTOMETRIC,
     RESULTS,
+    ROUGH_TURBULENCE,
     TOLERANCE_PX,
     WARPS,
     Conditions,
@@ -42,7 +43,6 @@ from timing import (
 )
 from torch import Tensor
 
-import torchrefract as tr
 from torchrefract.data.frames import evenly_spaced
 from torchrefract.data.images import EXTENSIONS, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
@@ -129,10 +129,9 @@ def main() -> None:
 
 def settings() -> dict[str, list[Variant]]:
     """Return the variants of each effect, by its name."""
-    rough = partial(tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0))
     variants = {name: _tolerances_px(make) + _interpolations(make) for name, make in WARPS.items()}
     variants["divergence-free"] += _steps(WARPS["divergence-free"])
-    variants |= {"rough turbulence": _tolerances_px(rough), "all four warps": _tolerances_px(all_warps)}
+    variants |= {"rough turbulence": _tolerances_px(ROUGH_TURBULENCE), "all four warps": _tolerances_px(all_warps)}
     variants |= {name: _tolerances(make) for name, make in PHOTOMETRIC.items()}
     fog = PHOTOMETRIC["uniform fog"]
     linear = partial(fog, linear_light=True)

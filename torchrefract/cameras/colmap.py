@@ -81,8 +81,7 @@ def is_colmap(path: Path) -> bool:
         )
     if path.suffix.lower() != ".txt" or path.name == "cameras.txt":
         return path.name == "cameras.txt"
-    lines = (line.strip() for line in read_text(path).splitlines())
-    return any(_LINE.match(line) for line in lines if line and not line.startswith("#"))
+    return any(map(_LINE.match, _lines(path)))
 
 
 def colmap_rows(path: Path) -> dict[int, Callable[[], Camera]]:
@@ -96,15 +95,17 @@ def colmap_rows(path: Path) -> dict[int, Callable[[], Camera]]:
                 f"{list_names(map(str, files))}; state the file"
             )
         path = files[0]
-    if path.suffix.lower() == ".bin":
-        lines = list(_records(path))
-    else:
-        texts = (line.strip() for line in read_text(path).splitlines())
-        lines = [text.split() for text in texts if text and not text.startswith("#")]
+    lines = _records(path) if path.suffix.lower() == ".bin" else map(str.split, _lines(path))
     rows = [_row(path, words) for words in lines]
     if repeated := [number for number, count in Counter(number for number, _ in rows).items() if count > 1]:
         raise ValueError(f"path must hold each camera once, got {path} with {repeated[0]} twice")
     return dict(rows)
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text but for empty ones and comments."""
+    lines = (line.strip() for line in read_text(path).splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
 
 
 def _records(path: Path) -> Iterator[list[Any]]:

@@ -34,7 +34,9 @@ figcaption { font-size: 13px; max-width: 29rem; }
 """
 _OF_RUN = ("metric", "seed", "torchrefract", "torch")  # columns that are the same in all lines
 _SPACING = 0.08  # of the curves, severities
-_NUM_COLORS, _OPACITY, _SEEN_SHARE = 20, 0.5, 0.002  # of classes
+_OPACITY, _SEEN_SHARE = 0.5, 0.002  # of classes
+# Neighbors of tab20 are pairs of a dark and a light color: the dark ones come first.
+_PALETTE = [tuple(round(255 * value) for value in colormaps["tab20"](2 * (i % 10) + i // 10)[:3]) for i in range(20)]
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
 
 
@@ -300,8 +302,7 @@ def _with_boxes(example: Example) -> Image.Image:
 
 def _with_classes(prediction: Classes) -> Image.Image:
     """Draw the classes of an image half-transparent over it."""
-    palette = np.array([_class_color(i) for i in range(_NUM_COLORS)], np.uint8)
-    colors = palette[prediction.classes.long().cpu().numpy() % _NUM_COLORS]
+    colors = np.array(_PALETTE, np.uint8)[prediction.classes.long().cpu().numpy() % len(_PALETTE)]
     return Image.blend(Image.fromarray(pixels_of(prediction.image)), Image.fromarray(colors), _OPACITY)
 
 
@@ -312,17 +313,11 @@ def _legend(*predictions: Tensor) -> str:
         for name, count in zip(*(of.tolist() for of in classes.long().unique(return_counts=True)), strict=True):
             shares[name] = max(shares.get(name, 0.0), count / classes.numel())
     parts = [
-        f'<span class="class" style="background: rgb{_class_color(name % _NUM_COLORS)}"></span>{name}'
+        f'<span class="class" style="background: rgb{_PALETTE[name % len(_PALETTE)]}"></span>{name}'
         for name, share in sorted(shares.items())
         if share >= _SEEN_SHARE
     ]
     return f"<br>classes {' '.join(parts)}"
-
-
-def _class_color(index: int) -> tuple[int, int, int]:
-    # Neighbors of this map are pairs of a dark and a light color.
-    red, green, blue = (round(255 * value) for value in colormaps["tab20"](2 * (index % 10) + index // 10)[:3])
-    return red, green, blue
 
 
 def _jpeg(picture: Image.Image) -> str:

@@ -75,6 +75,7 @@ from torchrefract.fields.rectification import camera_flow
 from torchrefract.presets import cheap_dashcam
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
+from torchrefract.restoration.tasks import Restored
 from torchrefract.warping.flow import resize_flow
 from torchrefract.warping.warp import warp
 
@@ -230,9 +231,9 @@ def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dic
         def frames() -> Iterator[Tensor]:
             return (frame for _, frame in read_video(clip, range(num_frames)))
 
-        def convert(restore: Callable[[Sequence[Tensor]], list[Tensor]]) -> None:
+        def convert(restore: Callable[[Sequence[Tensor]], list[Restored]]) -> None:
             out = Path(folder, "restored.mp4")
-            convert_video(clip, out, change=lambda views: (pixels_of(restore([view[0]])[0]) for view in views))
+            convert_video(clip, out, change=lambda views: (pixels_of(restore([v[0]])[0].image[0]) for v in views))
 
         cameras: dict[str, Camera] = {}
         for name, network in {"estimate_lens, lines": None, "estimate_lens, both": predict}.items():
@@ -241,7 +242,7 @@ def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dic
             results[name] = {"frames_per_second": num_frames / (time.process_time() - start)}
             results[name]["error_px"], results[name]["nothing_px"] = errors(cameras[name], lens_flow(RENDERED_LENS)[0])
         pooled = LensRestorer(cameras["estimate_lens, both"])
-        for name, restore in {"restore, each frame": restorer, "restore, pool=lens": pooled}.items():
+        for name, restore in {"restore, each frame": restorer.restore, "restore, pool=lens": pooled.restore}.items():
             spent = seconds(partial(convert, restore), clock=time.process_time)
             results[name] = {"frames_per_second": num_frames / spent}
         results["restore, each frame"]["jitter_px"] = jitter([predict(frame) for frame in frames()])

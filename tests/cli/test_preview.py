@@ -3,20 +3,19 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
-import matplotlib.image
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from PIL import Image
+from pictures import save_clip
+from PIL import Image, ImageSequence
 
 import torchrefract as tr
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import prepare_arguments
-from torchrefract.data.images import fit, read_image
+from torchrefract.data.images import fit, pixels_of, read_image
 from torchrefract.data.media import read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -67,8 +66,7 @@ def shows(picture: np.ndarray, cell: np.ndarray) -> bool:
 def sheet_shows(sheet: Path, cell: torch.Tensor | None) -> bool:
     """Return True if a saved contact sheet contains (3, h, w)."""
     assert cell is not None
-    pixels = (255 * matplotlib.image.imread(sheet)[..., :3]).round().astype(np.uint8)
-    return shows(pixels, (255 * cell).round().byte().movedim(0, -1).numpy())
+    return shows(pictures_of(sheet)[0], pixels_of(cell))
 
 
 def row_of(effect: Effect, frame: torch.Tensor, *, seed: int = 0, depth: np.ndarray | None = None) -> ContactSheetRow:
@@ -77,12 +75,9 @@ def row_of(effect: Effect, frame: torch.Tensor, *, seed: int = 0, depth: np.ndar
 
 
 def pictures_of(path: Path) -> list[np.ndarray]:
+    """Return the frames of a picture or an animation."""
     with Image.open(path) as image:
-        pictures = []
-        for t in range(getattr(image, "n_frames", 1)):
-            image.seek(t)
-            pictures.append(np.asarray(image.convert("RGB")))
-    return pictures
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
 
 
 def still(path: Path, effect: Effect, frame: torch.Tensor, **options: Any) -> bool:
@@ -98,15 +93,7 @@ def flare_at(frame: torch.Tensor, t: int) -> np.ndarray:
 
 def as_displayed(image: torch.Tensor, *, factor: int = 10) -> np.ndarray:
     """Return (3, 24, 32) as an animation shows it, (240, 320, 3)."""
-    pixels = (255 * image).round().byte().movedim(0, -1).numpy()
-    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def write_video(path: Path, frames: list[torch.Tensor]) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
-    for frame in frames:
-        writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
-    writer.release()
+    return pixels_of(image).repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 # --- contact sheets
@@ -198,11 +185,8 @@ def test_only_a_bare_word_is_a_picture_and_there_is_at_most_one(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     overrides, options = ["seed=1", "~effects.Compose", "+a=b"], ["--config-dir", "mine", "-c", "job", "--resolve"]
     assert prepare_arguments("preview", overrides + options) == overrides + options
-    assert prepare_arguments("preview", [*options, "frame.png", *overrides]) == [
-        "image='frame.png'",
-        *overrides,
-        *options,
-    ]
+    words = prepare_arguments("preview", [*options, "frame.png", *overrides])
+    assert words == ["image='frame.png'", *overrides, *options]
     with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
         prepare_arguments("preview", ["my", "frame.png"])
 
@@ -387,7 +371,7 @@ def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
 def test_each_frame_of_an_animation_has_its_map_of_a_folder(call, frames, tmp_path, source):
     names = [f"frame{t}" for t in range(3)]
     if source == "drive.avi":
-        write_video(tmp_path / source, frames)
+        save_clip(tmp_path / source, [pixels_of(frame[0]) for frame in frames])
         frames = [frame for _, frame in read_video(tmp_path / source, range(12))]
         names = [f"{source}/{t:06d}" for t in range(3)]
     depths = [torch.full((1, 1, 24, 32), 5.0 + 40 * t) for t in range(3)]
@@ -425,7 +409,7 @@ def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path):
 
 def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, frames, tmp_path):
     path = tmp_path / "a: 100%05d.avi"  # neither a protocol nor a pattern of names
-    write_video(path, frames)
+    save_clip(path, [pixels_of(frame[0]) for frame in frames])
     decoded = [frame for _, frame in read_video(path, range(12))]
     assert call("preview", path.name, *FLARE, "out=flare.apng").out.endswith("12 frames\n")
     for t, shown in enumerate(pictures_of(tmp_path / "flare.apng")):

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,6 +62,12 @@ def encode(light: np.ndarray) -> np.ndarray:
 def maps_of(degraded: tr.Degraded) -> dict[str, Tensor]:
     """Return the image and all maps that the result has, by name."""
     return {name: value for name in MAPS if (value := getattr(degraded, name)) is not None}
+
+
+def floating_leaves(params: Any) -> dict[str, Tensor]:
+    """Return copies of the floating fields of parameters, which require a gradient."""
+    fields = {name: value for name, value in params._asdict().items() if value is not None}
+    return {name: value.clone().requires_grad_() for name, value in fields.items() if value.is_floating_point()}
 
 
 def assert_equal_maps(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:

@@ -345,7 +345,7 @@ def test_labels_in_a_folder_are_written_under_the_names_of_their_pictures(call, 
             assert [x - w / 2, y - h / 2, x + w / 2, y + h / 2] == pytest.approx(expected, abs=2e-3)
 
 
-def test_labels_that_name_no_picture_are_an_error_before_anything_is_files_in(call, folder):
+def test_labels_that_name_no_picture_are_an_error_before_anything_is_written(call, folder):
     coco(folder)
     (folder / "raw" / "a.png").unlink()
     message = call("degrade", *WORDS, "labels=boxes.json").message

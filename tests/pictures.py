@@ -8,7 +8,7 @@ from typing import Any, Literal
 import av
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 
 def smooth_picture(height: int = 48, width: int = 96, seed: int = 0) -> np.ndarray:
@@ -29,6 +29,12 @@ def load_picture(path: Path) -> np.ndarray:
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert pixels is not None, f"{path} cannot be read"
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def load_frames(path: Path) -> list[np.ndarray]:
+    """Return the frames (H, W, 3) that Pillow reads of a picture or an animation."""
+    with Image.open(path) as image:
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
 
 
 def save_turned(path: Path, pixels: np.ndarray, orientation: int) -> None:

@@ -112,6 +112,20 @@ def assert_close_images(actual: Tensor, expected: Tensor, *, shift_px: float = 0
     assert_close(actual.double(), expected.double(), rtol=1e-5, atol=tolerance)
 
 
+def seeded(function: Callable[..., Any], *inputs: Any) -> Any:
+    """Call a function from one global seed, so that an effect in it draws what it drew in the last such call."""
+    torch.manual_seed(3)
+    return function(*inputs)
+
+
+def assert_graph_agrees(effect: Callable[[Tensor], Tensor], image: Tensor, *, backend: str = "eager") -> None:
+    """Raise AssertionError unless a graph without a break draws and degrades twice as eager mode does."""
+    compiled = torch.compile(effect, fullgraph=True, backend=backend)
+    expected, actual = (seeded(lambda run: [run(image) for _ in range(2)], run) for run in (effect, compiled))
+    assert not torch.equal(*expected)
+    assert_close(actual, expected, rtol=0, atol=2e-4)
+
+
 def is_in_range(image: Tensor) -> bool:
     """Return True if an image is in [0, 1], or 0 ... 255, up to the rounding of bilinear weights."""
     if image.dtype is torch.uint8:

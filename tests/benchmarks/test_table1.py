@@ -3,10 +3,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
 import table1
 import torch
+from pictures import save_picture
 from table1 import MIX, Scores, effects_of
 
 from torchrefract import Frame, LensDistortion, Pair
@@ -58,19 +58,11 @@ def test_scores_are_those_of_the_task_with_nan_for_a_missing_map():
     assert math.isnan(scores[5])
 
 
-@pytest.mark.quick
-def test_frames_are_chosen_evenly():
-    assert table1._evenly(10, 0) == list(range(10))
-    assert table1._evenly(10, 3) == [0, 3, 6]
-    assert table1._evenly(2, 5) == [0, 1]
-
-
 def write_frames(tmp_path: Path) -> Path:
     image, _ = render_road_scenes(torch.arange(4), *SIZE, seed=2)
     for i, picture in enumerate(image):
         path = tmp_path / "frames" / ("train" if i < 2 else "val") / f"drive{i}_{i:04d}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), (255 * picture).byte().permute(1, 2, 0).numpy()[..., ::-1])
+        save_picture(path, (255 * picture).byte().permute(1, 2, 0).numpy())
     return tmp_path / "frames"
 
 

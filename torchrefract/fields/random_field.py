@@ -52,7 +52,7 @@ def covariance(distance: Tensor, length: Tensor, kind: str) -> Tensor:
     return (1 + a if kind == "matern32" else 1 + a + a * a / 3) * torch.exp(-a)
 
 
-def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor) -> Tensor:
+def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor | None = None) -> Tensor:
     """Compute (N,), 1/px: the root mean square difference of neighboring pixels of fields of variance 1.
 
     sqrt(2 (1 - C(1) / C(0))),  C smoothed by the aperture a twice, for which it is a sum of Gaussians:
@@ -60,7 +60,7 @@ def gradient_rms(length: Tensor, *, kind: str, aperture: Tensor) -> Tensor:
     """
     weight, scale = gaussian_mixture(kind, length.device)
     variance = length.double()[:, None].square() * scale
-    spread = variance + 2 * aperture.double()[:, None].square()
+    spread = variance if aperture is None else variance + 2 * aperture.double()[:, None].square()
     weight = weight * variance / spread
     return (-2 * (weight * torch.expm1(-0.5 / spread)).sum(dim=1) / weight.sum(dim=1)).sqrt()
 

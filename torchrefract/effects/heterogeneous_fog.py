@@ -374,7 +374,8 @@ class HeterogeneousFog(PhotometricEffect):
     def _unclip_lamps(self, image: Tensor, params: HeterogeneousFogParams) -> Tensor:
         """Return images in which lamps are brighter than white, in fog that is dark."""
         is_dark = luma(finite_or(params.airlight, 0.0).to(image.dtype)[:, :, None, None]) < _DARK_AIRLIGHT
-        return unclip_lamps(image, torch.where(expand_batch(is_dark, len(image)), self.lamp_luminance, 1.0))
+        luminance = image.new_full((), self.lamp_luminance)  # torch.where of two numbers is of the default type
+        return unclip_lamps(image, torch.where(expand_batch(is_dark, len(image)), luminance, 1.0))
 
     def _extinction(
         self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan

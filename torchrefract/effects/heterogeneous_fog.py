@@ -58,7 +58,7 @@ _ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
 _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
-_EVEN = 1e12  # m, a scale height at which the density is even
+_EVEN = 1e30  # m, a scale height at which the density is even up to the sky
 _FARTHEST_PX = 1e5  # of a box
 _DARK_AIRLIGHT = 0.4  # luma, below which fog is that of the night
 

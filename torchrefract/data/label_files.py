@@ -25,7 +25,7 @@ from torchrefract.data.frames import list_files
 from torchrefract.data.images import image_header, opened
 from torchrefract.labels.boxes import polygon_area, warp_boxes, warp_polygons
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
+from torchrefract.labels.points import in_frame, solve_points
 from torchrefract.labels.vehicles import LabeledBoxes
 
 _SUFFIXES = (".txt", ".png")  # of YOLO and masks
@@ -333,7 +333,7 @@ def _moved_keypoints(keypoints: Sequence[float], flow: Tensor) -> list[float]:
     if not keypoints:
         return []
     rows = torch.tensor(keypoints, dtype=flow.dtype).view(1, -1, 3)
-    points, converged, upright = solve_points(rows[..., :2], flow[None], STEPS, TOLERANCE_PX)
+    points, converged, upright = solve_points(rows[..., :2], flow[None])
     is_visible = converged & upright & in_frame(points, flow[None], 0.5) & (rows[..., 2] > 0)
     flat = (torch.cat([points, rows[..., 2:]], dim=2) * is_visible[..., None])[0].tolist()
     return [value for x, y, v in flat for value in (*_rounded([x, y]), int(v))]

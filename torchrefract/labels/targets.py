@@ -19,15 +19,16 @@ from torchrefract._validation import check_choice, check_flag, check_tensor, eag
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.plain_values import check_moves, name_of
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_coordinates, in_frame, solve_points
+from torchrefract.labels.points import check_coordinates, in_frame, solve_points
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, warp
 
+# Formats of rotated boxes, by their names in torchvision.
+ROTATED = ("XYWHR", "CXCYWHR", "XYXYXYXY")
 # Values without a position in the image, which pass unchanged.
 _PLAIN = (
     *(type(None), str, bytes, numbers.Number, np.generic, np.ndarray),
     *(enum.Enum, os.PathLike, datetime.date, datetime.time, datetime.timedelta),
 )
-_SAMPLES_PER_EDGE = 64
 _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible", "keypoint_visibility")
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
@@ -247,7 +248,7 @@ def _warp_keypoints(keypoints: Any, flow: Tensor) -> _Warped:
     _check_batch(plain, flow)
     rows = plain.reshape(batch.shape[0], plain[..., 0].numel() // batch.shape[0], 2)
     check_coordinates("keypoints", rows, batch, 2)
-    points, converged, upright = solve_points(rows, batch, STEPS, TOLERANCE_PX)
+    points, converged, upright = solve_points(rows, batch)
     # A keypoint may lie on the outer half of a border pixel.
     on_canvas = in_frame(points, batch, 0.5)
     visible = converged & upright & on_canvas
@@ -266,13 +267,13 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if len(plain) == 0:
         return _Warped(boxes, torch.ones(0, dtype=torch.bool, device=plain.device))
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
-    if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
+    if boxes.format.name in ROTATED:
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
         warped = _cast(warped, boxes.dtype)
     else:
         corners = convert_boxes(plain, boxes.format.name, "XYXY") - 0.5
         limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
-        warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
+        warped, keep = warp_boxes(corners, flow, clip=options.clip, **limits)
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
         warped = _cast(convert_boxes(warped + 0.5, "XYXY", boxes.format.name), boxes.dtype)
@@ -283,7 +284,7 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
 
 def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
     corners = convert_boxes(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
-    outlines = warp_outlines(corners, flow[None], samples=_SAMPLES_PER_EDGE)
+    outlines = warp_outlines(corners, flow[None])
     axes = _box_axes(outlines.points, outlines.converged, corners)
     extent = outlines.extent(axes)
     keep = extent.keep(options.min_area, options.min_visibility)

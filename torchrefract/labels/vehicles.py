@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract.labels.plain_values import name_of
-from torchrefract.labels.targets import convert_boxes, is_tv_tensor
+from torchrefract.labels.targets import ROTATED, convert_boxes, is_tv_tensor
 
 # Names of classes, as data sets of roads write them.
 VEHICLES = (
@@ -95,7 +95,7 @@ def _corners(boxes: Any) -> Tensor:
     """Return the smallest upright boxes, (N, 4), px from the center of the first pixel."""
     plain, form = boxes.as_subclass(Tensor), boxes.format.name
     plain = plain if plain.is_floating_point() else plain.to(torch.float32)
-    if form not in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
+    if form not in ROTATED:
         return convert_boxes(plain, form, "XYXY") - 0.5
     points = convert_boxes(plain, form, "XYXYXYXY").unflatten(-1, (4, 2))
     return torch.cat([points.amin(dim=-2), points.amax(dim=-2)], dim=-1) - 0.5

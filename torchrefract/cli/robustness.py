@@ -54,7 +54,6 @@ from torchrefract.data.label_files import (
     PictureLabels,
     YoloFile,
     boxes_of_coco,
-    boxes_of_yolo,
     read_labels,
 )
 from torchrefract.data.media import describe_turned
@@ -293,14 +292,14 @@ def _folder(cfg: DictConfig) -> _Folder:
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     """Return the labels of a picture (3, H, W) as torchvision's types; without a YOLO file it holds nothing."""
     size = (image.shape[1], image.shape[2])
-    content: Any = [] if labels is None else labels.move(None, size).content  # raises for labels of another size
+    boxes, classes = np.zeros((0, 4)), []
     if isinstance(labels, MaskFile):
-        with Image.open(io.BytesIO(content)) as picture:
+        with Image.open(io.BytesIO(labels.move(None, size).content)) as picture:  # raises for a mask of another size
             return tv_tensors.Mask(np.array(picture).astype(np.int32))
     if isinstance(labels, YoloFile):
-        boxes, classes = boxes_of_yolo(content, labels, size)
-    else:
-        annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
+        boxes, classes = labels.boxes(size)
+    elif labels is not None:
+        annotations = [a for a in labels.move(None, size).content if not a.get("iscrowd")]
         for annotation in annotations:
             if not annotation.get("bbox") or not isinstance(annotation.get("category_id"), int):
                 raise ValueError(

@@ -174,7 +174,7 @@ def test_progress_hands_on_its_items_and_prints_a_line_outside_a_terminal_only_i
     for item in progress(range(2), "working", count=2):
         if item == 1:
             time.sleep(0.2)
-    assert capsys.readouterr().err.startswith("working: 1 of 2, 0 s\n")
+    assert capsys.readouterr().err.startswith("working: 1 of 2, 0 s, about 0 s left\n")
 
 
 # --- arguments

@@ -235,7 +235,9 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
     def report() -> None:
         start = time.monotonic()
         while not finished.wait(_MESSAGE_INTERVAL):
-            print(f"{name}: {done} of {count}, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+            seconds = time.monotonic() - start
+            left = f", about {seconds * (count - done) / done:.0f} s left" if done else ""
+            print(f"{name}: {done} of {count}, {seconds:.0f} s{left}", file=sys.stderr, flush=True)
 
     threading.Thread(target=report, daemon=True).start()
     try:

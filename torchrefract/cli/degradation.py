@@ -24,7 +24,6 @@ from torchrefract._io import is_remote, make_folder, relative_name, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
 from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
-    check_memory,
     check_seed,
     depth_folder,
     file_digests,
@@ -261,7 +260,6 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
     labels = _labels(cfg, pictures)
     job = _job(cfg, out, root, pictures, labels)
     workers = read_workers(cfg)
-    check_memory(workers, out=out, source=source, **({"depth": job.depth.root} if job.depth else {}))
     if is_remote(out) and isinstance(labels, CocoLabels):
         raise UsageError(
             f"out must lie on this machine for labels of COCO, which a run continues line by line, got {out}; write to "

@@ -3,21 +3,18 @@
 import json
 import os
 import shutil
-import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils import _pytree as pytree
 
 import torchrefract
@@ -31,9 +28,8 @@ from torchrefract._validation import (
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, print_warning, warn_of_assumed_depth
+from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
-    check_memory,
     check_seed,
     depth_folder,
     disk_errors,
@@ -73,15 +69,12 @@ from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import LIST, Sources, find_sources, read_sources
 from torchrefract.data.workers import map_in_processes
 
-_T = TypeVar("_T")
-
 _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the manifest state all
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _TAGS = 16  # frames whose orientation is read beside a camera
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
 _VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 _VERSIONS |= {"numpy": np.__version__, "opencv": cv2.__version__}
-_MESSAGE_INTERVAL = 60.0  # seconds
 
 
 class Shard(NamedTuple):
@@ -159,13 +152,14 @@ def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
         _check_disk(options, [number for unit in units for number in unit], storage)
         tasks = ([options.task(number) for number in unit] for unit in units)
         workers = min(options.workers, len(units))
-        rows = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
+        made = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
         try:
-            for unit in _with_progress(rows, total=sum(map(len, units))):
-                lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
-                readable = [row for row in unit if not row.skipped.startswith(LOST)]
-                manifest.add(readable)
-                num_made += sum(not row.skipped for row in readable)
+            for row in progress(chain.from_iterable(made), "making pairs", count=sum(map(len, units))):
+                if row.skipped.startswith(LOST):
+                    lost.append(row.skipped.removeprefix(LOST))
+                else:
+                    manifest.add(row)
+                    num_made += not row.skipped
         finally:
             manifest.flush()
     manifest.close()
@@ -208,7 +202,6 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     if engine["name"] == "ray" and engine["address"]:
         check_cluster(str(engine["address"]))
     source = read_path(cfg, "source")
-    check_memory(workers, out=out, source=source)
     if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
@@ -223,7 +216,6 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         if turned := describe_turned([*paths.values()], upright=True):
             print_warning(turned)
     if (depth := depth_folder(cfg)) is not None:
-        check_memory(workers, depth=depth.root)
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
@@ -324,27 +316,6 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
             f"out must have enough space, got too little: {estimate}; choose another disk or a lower count"
         )
     print(estimate, flush=True)
-
-
-def _with_progress(units: Iterable[list[PairRow]], *, total: int) -> Iterator[list[PairRow]]:
-    """Yield units of pairs; show progress in a terminal, and print a line a minute elsewhere."""
-    console = Console(stderr=True)
-    start = printed = time.monotonic()
-    done = 0
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("pairs, {task.fields[rate]}"), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, rate="")
-        for unit in units:
-            yield unit
-            done += len(unit)
-            now = time.monotonic()
-            rate = done / max(now - start, 1e-9)
-            bar.update(task, completed=done, rate=f"{rate:.3g} a second")
-            if now - printed > _MESSAGE_INTERVAL and not console.is_terminal:
-                printed, minutes = now, (total - done) / rate / 60
-                print(
-                    f"{done} of {total} pairs, {rate:.3g} a second, {minutes:.0f} min left", file=sys.stderr, flush=True
-                )
 
 
 def _finish(options: Options, out: Path, *, num_made: int) -> None:

@@ -66,9 +66,19 @@ def read_optional(cfg: DictConfig, name: str, check: Callable[..., _T], **limits
 
 
 def read_workers(cfg: DictConfig) -> int:
-    """Return the number of processes; null is one for each core."""
+    """Return the number of processes; null is one for each core.
+
+    Raises:
+        UsageError: processes would share a path in memory://.
+    """
     workers = read_optional(cfg, "workers", check_count, low=0)
-    return num_cores() if workers is None else workers
+    workers = num_cores() if workers is None else workers
+    for name in ("out", "source", "depth"):
+        if workers and str(cfg[name]).startswith("memory://"):
+            raise UsageError(
+                f"workers must be 0 for {name}={cfg[name]}, because each process has its memory, got {workers}"
+            )
+    return workers
 
 
 def read_path(cfg: DictConfig, name: str) -> Path:
@@ -204,13 +214,6 @@ def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
         yield source, out
 
 
-def check_memory(workers: int, **paths: Path) -> None:
-    """Raise UsageError if processes would share a path in memory://, by the name of its option."""
-    for name, path in paths.items():
-        if workers and "memory" in getattr(path, "protocol", ""):
-            raise UsageError(f"workers must be 0 for {name}={path}, because each process has its memory, got {workers}")
-
-
 @contextmanager
 def disk_errors(out: Path) -> Iterator[None]:
     """Turn errors of the disk into messages for the user; files that are written stay."""
@@ -227,6 +230,3 @@ def disk_errors(out: Path) -> Iterator[None]:
         raise UsageError(
             f"out must be a folder that can be written to, got {out} ({error.strerror or error})"
         ) from error
-    except KeyboardInterrupt:
-        print("stopped; the same command continues")
-        raise SystemExit(130) from None

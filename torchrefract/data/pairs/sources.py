@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 from torchrefract._io import is_remote, read_bytes, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, evenly_spaced, list_names, select_val_drives, split_frames
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
+from torchrefract.data.frames import Source, check_sizes, evenly_spaced, list_names, select_val_drives, split_frames
+from torchrefract.data.images import EXTENSIONS
 from torchrefract.data.media import VIDEOS, video_info
 from torchrefract.random import key_of
 
@@ -130,7 +130,11 @@ def find_sources(
     if not videos:
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(source, files, split=None, **options)
-        _check_sample(source, [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]], size or (1, 1))
+        sample = [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]]
+        unreadable = check_sizes(source, sample, size or (1, 1))
+        if len(unreadable) == len(sample):
+            reasons = first_names([f"{path} {reason}" for path, reason in unreadable.items()])
+            raise ValueError(f"root must hold readable frames, got {reasons} in {source}")
         return Sources(source, table_of(frames, size_of))
     if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
         both = f"{images[0]} and {videos[0]}"
@@ -160,24 +164,6 @@ def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
     """
     key = key_of(source.name if repeat == 0 else f"{source.name}\0{repeat}")
     return (seed << 32) + (source.split != "val"), key
-
-
-def _check_sample(root: Path, paths: Sequence[str], size: tuple[int, int]) -> None:
-    """Raise ValueError if a few images are all unreadable, or one is smaller than `size`."""
-    reasons = []
-    for path in paths:
-        try:
-            H, W = image_size(root / path)
-        except UnreadableImageError as error:
-            reasons.append(str(error).replace(f"{root}/", ""))
-            continue
-        if size[0] > H or size[1] > W:
-            raise ValueError(
-                f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {path} of {H}x{W} in "
-                f"{root}; choose a smaller size or remove them"
-            )
-    if len(reasons) == len(paths):
-        raise ValueError(f"root must hold readable frames, got {first_names(reasons)} in {root}")
 
 
 def table_of(frames: Sequence[Source], size_of: Callable[[str], int | None]) -> pa.Table:

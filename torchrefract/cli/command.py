@@ -26,7 +26,7 @@ from rich.progress import track
 from torch import nn
 from yaml import YAMLError
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
 from torchrefract.cli.options import FILE_ERRORS
@@ -185,7 +185,7 @@ def require_task(name: str, arguments: list[str]) -> list[str]:
         if argument.startswith("task="):
             raise UsageError(f"{argument} needs a plus, since no task is chosen yet: {example} +{argument}")
     if not any(argument.startswith(_TASK_OPTIONS) for argument in arguments):
-        tasks = sorted(path.stem for path in Path(CONFIG_DIR, "task").glob("*.yaml"))
+        tasks = config_names("task")
         raise UsageError(f"+task must be one of {', '.join(tasks)}: {example} +task={tasks[-1]}, got none")
     return arguments
 
@@ -353,7 +353,7 @@ def _user_message(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if str(error).startswith("Config group override must be"):  # a ValueError of Hydra
         for group, value in (word.groups() for word in map(_NO_NAME.fullmatch, sys.argv[1:]) if word):
-            if choices := sorted(path.stem for path in Path(CONFIG_DIR, group).glob("*.yaml")):
+            if choices := config_names(group):
                 return f"{group} must be one of {', '.join(choices)}, got {value}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"

@@ -143,8 +143,6 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
 
 def evaluate(cfg: DictConfig) -> None:
     """Score a checkpoint, by default on the data that it was validated on."""
-    if cfg.ckpt_path is None:
-        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
     path = find_checkpoint(str(cfg.ckpt_path))
     checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     changed = use_validation_config(cfg, checkpoint, list(HydraConfig.get().overrides.task), path)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_opencv, write_kalibr, write_opencv
-from torchrefract.data.media import video_info
+from torchrefract.data.video import video_info
 from torchrefract.fields.rectification import camera_flow
 
 PINHOLE = {"width": 96, "height": 64, "fx": 70.0, "fy": 71.0, "cx": 46.2, "cy": 33.1}

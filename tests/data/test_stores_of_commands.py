@@ -18,9 +18,9 @@ from torch.utils.data import DataLoader
 
 from torchrefract._io import as_path
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.media import write_video
 from torchrefract.data.module import fingerprint
 from torchrefract.data.pairs import PairedFolder
+from torchrefract.data.video import write_video
 
 ROOT = Path(__file__).parents[2]
 WORDS = ("scene=paper_refractive", "workers=0")

@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -43,7 +42,7 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
-from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.command import Skipped, check_none_lost, print_warning, progress
 from torchrefract.cli.options import make, naming, read_option
 from torchrefract.data import media
 from torchrefract.data.images import (
@@ -58,6 +57,7 @@ from torchrefract.data.images import (
 )
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.video import convert_video
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
 
@@ -290,7 +290,7 @@ def rectify(cfg: DictConfig) -> None:
             zoom = max(zoom, zoom_to_crop(camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
-    files = media.find_media(source)
+    files = media.find_media(source, out=out)
     _claim_for_cameras(out, source, {"lens.yaml": camera, CAMERA_FILE: pinhole})
     if not exists.all():
         share = 1 - exists.double().mean().item()
@@ -323,33 +323,27 @@ def rectify(cfg: DictConfig) -> None:
     def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
         return (pixels_of(rectify_frame(frame)) for frame in frames)
 
-    num_written, failed = 0, dict[Path, ValueError]()
+    num_existing, skipped = 0, Skipped()
     with locked("out", out):
         for file in progress(files, "rectifying", count=len(files)):
             target = out / media.output_name(file).name
             try:
                 if is_complete(file, target):
+                    num_existing += 1
                     continue
                 with replace_file(target, alone=True) as path:
                     if media.is_video(file):
-                        media.convert_video(file, path, change=rectify_frames, upright=False)
+                        convert_video(file, path, change=rectify_frames, upright=False)
                     else:
                         frame = read_image(file, upright=False)[None].contiguous()
                         media.write_picture(rectify_frame(frame), path, source=file, upright=False)
-                num_written += 1
             except ValueError as error:
-                named = error if isinstance(error, UnreadableImageError) else ValueError(f"{file}: {error}")
-                failed[file] = named.with_traceback(None)  # which would keep frames and open files until the end
-                print(f"skipped: {failed[file]}", file=sys.stderr)
-    if len(failed) == len(files):
-        raise UsageError(f"input must hold a file that can be rectified, got {next(iter(failed.values()))}")
-    num_existing = len(files) - len(failed) - num_written
+                named = f"{error}" if isinstance(error, UnreadableImageError) else f"{file}: {error}"
+                skipped.add(named, is_lost=is_lost(error))
+    counts = skipped.summarize("rectified", total=len(files), existing=num_existing)
     _warn_of_other_sizes(sizes, camera, out / CAMERA_FILE)
-    print(
-        f"{out}: {num_written} rectified, {num_existing} already existed, {len(failed)} skipped; camera of the "
-        f"results: {out}/{CAMERA_FILE}"
-    )
-    check_none_lost([str(error) for error in failed.values() if is_lost(error)])
+    print(f"{out}: {counts}; camera of the results: {out}/{CAMERA_FILE}")
+    check_none_lost(skipped.lost)
 
 
 def _read_zoom(cfg: DictConfig) -> float:
@@ -380,10 +374,9 @@ def _part_to_keep(
 
 def _claim_for_cameras(out: Path, source: Path, cameras: Mapping[str, Camera]) -> None:
     """Create the output folder with the files of cameras; raise UsageError if it is of another input or camera."""
-    media.check_output_folder(out, source)
     folder = source if source.is_dir() else source.parent
     with naming("out"):
-        claim(out, {"input": str(folder.resolve())}, count=0, about={})
+        claim(out, {"input": str(folder.resolve())})
     for name, camera in cameras.items():
         _write_camera(out / name, camera)
 

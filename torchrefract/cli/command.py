@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -246,6 +247,40 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
             done += 1
     finally:
         finished.set()
+
+
+def batches(items: Iterable[_T], size: int) -> Iterator[list[_T]]:
+    """Yield up to `size` items in a row, as itertools.batched of Python 3.12 does."""
+    rest = iter(items)
+    while batch := list(islice(rest, size)):
+        yield batch
+
+
+class Skipped:
+    """The files or frames of an input that a command skips, by the errors that name them."""
+
+    def __init__(self):
+        self.errors, self.lost = list[str](), list[str]()  # all, and those of files that vanished
+
+    def add(self, error: str, *, is_lost: bool = False) -> None:
+        """Print an error and note it; an exception would keep frames and open files until the end."""
+        print(f"skipped: {error}", file=sys.stderr)
+        self.errors.append(error)
+        self.lost += [error] if is_lost else []
+
+    def summarize(self, verb: str, *, total: int, existing: int, name: str = "input") -> str:
+        """Return how many files were converted; raise UsageError if all were skipped.
+
+        Args:
+            verb: what the command does to a file, as "restored".
+            total: number of files.
+            existing: number of those that were converted before.
+            name: of the option that gives the input.
+        """
+        if len(self.errors) == total:
+            raise UsageError(f"{name} must hold a file that can be {verb}, got {self.errors[0]}")
+        num_made = total - existing - len(self.errors)
+        return f"{num_made} {verb}, {existing} already existed, {len(self.errors)} skipped"
 
 
 def check_none_lost(lost: Sequence[str], *, name: str = "input") -> None:

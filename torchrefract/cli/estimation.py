@@ -3,7 +3,7 @@
 import statistics
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import accumulate, count
+from itertools import accumulate, count, groupby
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -17,7 +17,7 @@ from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.command import print_warning, progress
+from torchrefract.cli.command import Skipped, batches, print_warning, progress
 from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
@@ -25,6 +25,7 @@ from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.video import read_video, video_info
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 from torchrefract.warping.flow import resize_image
 
@@ -45,8 +46,7 @@ def estimate_depth(cfg: DictConfig) -> None:
 
 def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     size = read_option(cfg, "batch", check_count)
-    files = media.find_media(source, deep=True, name="source")
-    media.check_output_folder(out, source, deep=True, name="source")
+    files = media.find_media(source, out=out, deep=True, name="source")
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent
     pictures = [relative_name(file, root) for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
@@ -61,14 +61,14 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
         if (out / "config.json").is_file():
             _claim(cfg, out, root)
         make_folder(out)
-    skipped, spreads = dict[str, str](), list[float]()
+    skipped, spreads = Skipped(), list[float]()
     num_written = 0
     with locked("out", out):
         frames = _missing_frames(progress(files, "estimating depth", count=len(files)), root, folder, skipped)
         for batch in _batches(frames, size):
             for frame, result in zip(batch, network.each(torch.stack([frame.image for frame in batch])), strict=True):
                 if isinstance(result, RoadSpreadError):
-                    _skip(skipped, frame.name, f"{frame.name}: {result}")
+                    skipped.add(f"{frame.name}: {result}")
                     continue
                 if num_written == 0:
                     _claim(cfg, out, root)
@@ -76,11 +76,11 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
                 write_depth(frame.target, result.depth[0].cpu())
                 num_written += 1
                 spreads += [] if result.spread is None else [result.spread]
-    if num_written == 0 and skipped:
-        raise UsageError(f"source must hold a frame whose depth can be estimated, got {next(iter(skipped.values()))}")
+    if num_written == 0 and skipped.errors:
+        raise UsageError(f"source must hold a frame whose depth can be estimated, got {skipped.errors[0]}")
     spread = f", median spread of the scale {statistics.median(spreads):.2f}" if spreads else ""
-    print(f"{out}: {num_written} depth maps written, {len(skipped)} frames skipped{spread}")
-    if skipped:
+    print(f"{out}: {num_written} depth maps written, {len(skipped.errors)} frames skipped{spread}")
+    if skipped.errors:
         raise SystemExit(1)
 
 
@@ -91,12 +91,10 @@ def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
     content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
-    claim(out, {"source": str(root.resolve()), "model": content}, count=0, about={})
+    claim(out, {"source": str(root.resolve()), "model": content})
 
 
-def _missing_frames(
-    files: Iterable[Path], root: Path, folder: DepthFolder, skipped: dict[str, str]
-) -> Iterator[_Frame]:
+def _missing_frames(files: Iterable[Path], root: Path, folder: DepthFolder, skipped: Skipped) -> Iterator[_Frame]:
     """Yield the frames that have no map yet, or changed since; name those that cannot be read."""
     # Maps of another program may be older than copies of its frames.
     is_claimed = not is_remote(folder.root) and (folder.root / "config.json").is_file()
@@ -108,30 +106,19 @@ def _missing_frames(
         name = relative_name(file, root)
         try:
             if media.is_video(file):
-                for index, image in media.read_video(file, count()):
+                for index, image in read_video(file, count()):
                     if not has_map(file, name, index):
                         yield _Frame(image[0], folder.path(name, index), f"{name}#{index}")
             elif not has_map(file, name):
                 yield _Frame(read_image(file), folder.path(name), name)
         except UnreadableImageError as error:
-            _skip(skipped, name, str(error))
-
-
-def _skip(skipped: dict[str, str], name: str, reason: str) -> None:
-    skipped[name] = reason
-    print(f"skipped: {reason}", file=sys.stderr)
+            skipped.add(str(error))
 
 
 def _batches(frames: Iterator[_Frame], size: int) -> Iterator[list[_Frame]]:
     """Yield up to `size` frames in a row of one shape."""
-    batch = list[_Frame]()
-    for frame in frames:
-        if batch and (len(batch) == size or frame.image.shape != batch[0].image.shape):
-            yield batch
-            batch = []
-        batch.append(frame)
-    if batch:
-        yield batch
+    for _, group in groupby(frames, lambda frame: frame.image.shape):
+        yield from batches(group, size)
 
 
 def estimate_lens(cfg: DictConfig) -> None:
@@ -202,7 +189,7 @@ def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device
 def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
     # A video that states no frames is read too, which says why it has none.
-    counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
+    counts = [max(1, video_info(file)[0]) if media.is_video(file) else 1 for file in files]
     numbers, chosen = evenly_spaced(sum(counts), max_frames), list[tuple[Path, list[int]]]()
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
         chosen.append((file, [number - start for number in numbers if start <= number < end]))
@@ -216,7 +203,7 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
         num_before = num_read
         try:
             if media.is_video(file):
-                frames = (frame for _, frame in media.read_video(file, times, upright=upright))
+                frames = (frame for _, frame in read_video(file, times, upright=upright))
             else:
                 frames = (read_image(file, upright=upright)[None] for _ in times)
             for frame in frames:

@@ -15,8 +15,8 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from torchrefract._io import as_path
-from torchrefract.data.media import write_video
 from torchrefract.data.pairs import PairedFolder, PairStream
+from torchrefract.data.video import write_video
 
 ROOT = Path(__file__).parents[3]
 

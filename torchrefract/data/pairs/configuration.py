@@ -22,8 +22,8 @@ def claim(
     out: Path,
     settings: Mapping[str, Any],
     *,
-    count: int,
-    about: Mapping[str, Any],
+    count: int = 0,
+    about: Mapping[str, Any] | None = None,
     earlier: Mapping[str, Any] | None = None,
     suffix: str = "",
 ) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def claim(
 
     Args:
         settings: everything that determines the content, of types that JSON has.
-        count: number of results; a later run may raise it.
+        count: number of results, which a later run may raise; 0 if the settings decide it.
         about: further entries of config.json that do not change the content.
         earlier: values of settings that folders of earlier versions do not state.
         suffix: of a shard, which gets a copy of config.json, so that `check_shards` can compare those of shards that
@@ -61,7 +61,7 @@ def claim(
                 raise UsageError(f"count must be at least that of the pairs in {out}, {config['count']}, got {count}")
     elif others:
         raise UsageError(f"out must be a new folder or one of this command, got {out}, which holds {others[0]}")
-    document = {"settings": new, "count": count, **about}
+    document = {"settings": new, "count": count, **(about or {})}
     for target in (path, path.with_name(f"config{suffix}.json")) if suffix else (path,):
         if document != previous or not target.is_file():
             write_file(target, json.dumps(document, indent=2) + "\n")

@@ -15,7 +15,8 @@ from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, check_sizes, evenly_spaced, list_names, select_val_drives, split_frames
 from torchrefract.data.images import EXTENSIONS
-from torchrefract.data.media import VIDEOS, video_info
+from torchrefract.data.media import VIDEOS
+from torchrefract.data.video import video_info
 from torchrefract.random import key_of
 
 LIST = "sources.parquet"  # the list in the folder of a set

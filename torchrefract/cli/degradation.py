@@ -122,17 +122,16 @@ class Degrader(NamedTuple):
 
     def _picture(self, task: _Task, file: Path, path: Path) -> _Result:
         degraded = self._degraded(file, task.name, task.labels)
-        result = _Result(task.name, num_frames=1)
+        num_dropped, annotations = 0, None
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
-            result = result._replace(num_dropped=num_dropped)
             if isinstance(task.labels, CocoAnnotations):
-                result = result._replace(annotations=content)
+                annotations = content
             else:
                 _write(self.out / "labels" / PurePosixPath(task.name).with_suffix(task.labels.path.suffix), content)
         is_beyond = self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
         media.write_picture(degraded.image[0], path, source=file)
-        return result._replace(is_beyond=is_beyond)
+        return _Result(task.name, 1, num_dropped, annotations, is_beyond=is_beyond)
 
     def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()

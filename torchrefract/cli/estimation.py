@@ -23,7 +23,7 @@ from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.configuration import CONFIG, claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.video import read_video, video_info
 from torchrefract.depth import RoadSpreadError, TransformersDepth
@@ -58,7 +58,7 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     if not isinstance(network, TransformersDepth):
         raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
     with naming("out"):
-        if (out / "config.json").is_file():
+        if (out / CONFIG).is_file():
             _claim(cfg, out, root)
         make_folder(out)
     skipped, spreads = Skipped(), list[float]()
@@ -87,7 +87,7 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
 def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
     """Note the settings in the output folder; raise UsageError if its maps are of another network, road or source."""
     names = [path.name for path in matching_files(out, "*") if not path.name.startswith(".")]
-    if names and "config.json" not in names:
+    if names and CONFIG not in names:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
     content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
@@ -97,7 +97,7 @@ def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
 def _missing_frames(files: Iterable[Path], root: Path, folder: DepthFolder, skipped: Skipped) -> Iterator[_Frame]:
     """Yield the frames that have no map yet, or changed since; name those that cannot be read."""
     # Maps of another program may be older than copies of its frames.
-    is_claimed = not is_remote(folder.root) and (folder.root / "config.json").is_file()
+    is_claimed = not is_remote(folder.root) and (folder.root / CONFIG).is_file()
 
     def has_map(file: Path, name: str, index: int | None = None) -> bool:
         return folder.has(name, index) and not (is_claimed and media.is_older(folder.path(name, index), file))

@@ -1,6 +1,5 @@
 """The commands `generate`, which writes pairs to disk, and `merge`, which joins the manifests of its shards."""
 
-import json
 import os
 import shutil
 from collections import Counter
@@ -18,7 +17,7 @@ from rich.filesize import decimal
 from torch.utils import _pytree as pytree
 
 import torchrefract
-from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
+from torchrefract._io import as_path, is_remote, make_folder, remove_file
 from torchrefract._validation import (
     UsageError,
     check_choice,
@@ -46,7 +45,7 @@ from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.card import summarize, write_card
-from torchrefract.data.pairs.configuration import check_shards, claim, shard_configs, shard_suffix
+from torchrefract.data.pairs.configuration import CONFIG, check_shards, claim, read_config, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -376,11 +375,11 @@ def merge(cfg: DictConfig) -> None:
 def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
     """Return the settings, the number of pairs and the license in config.json."""
     try:
-        document = json.loads(read_bytes(out / "config.json"))
-        settings = document["settings"]
+        config = read_config(out / CONFIG)
+        settings = config["settings"]
         _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
-        return settings, int(document["count"]), str(document["license"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return settings, int(config["count"]), str(config["license"])
+    except (OSError, UsageError, KeyError, TypeError) as error:
         raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error
 
 

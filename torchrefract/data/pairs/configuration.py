@@ -50,8 +50,8 @@ def claim(
     # List the folder before testing for config.json, because another shard may be writing to it.
     others = sorted(file.name for file in (out.iterdir() if out.is_dir() else ()) if not file.name.startswith("."))
     if path.is_file():
-        previous = _read(path)
-        for config in (previous, *map(_read, shard_configs(out))):
+        previous = read_config(path)
+        for config in (previous, *map(read_config, shard_configs(out))):
             if different := _differences({**(earlier or {}), **config.get("settings", {})}, new, "there", "here"):
                 raise UsageError(
                     f"out must be a folder of the same configuration, got {out}, where {different}; choose another "
@@ -75,7 +75,7 @@ def check_shards(out: Path, settings: Mapping[str, Any], count: int) -> int:
         UsageError: shards have other settings, as those that were made in several folders and copied into one.
     """
     for path in shard_configs(out):
-        config = _read(path)
+        config = read_config(path)
         if different := _differences(config.get("settings", {}), settings, f"in {path.name}", f"in {CONFIG}"):
             raise UsageError(
                 f"out must hold shards of one configuration, got {out}, where {different}; make each set in a folder "
@@ -97,7 +97,8 @@ def remove_shard_config(manifest: Path) -> None:
         remove_file(path)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a config.json; raise UsageError if it is damaged."""
     try:
         config = json.loads(read_bytes(path))
     except ValueError:

@@ -139,8 +139,8 @@ def test_letters_that_a_redirected_output_lacks_are_escaped(monkeypatch):
     output = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding="cp1252", write_through=True))
     monkeypatch.setattr(sys, "argv", ["degrade", "--help"])
-    command("degrade", "folder 路 …", "none:none", file=None)()
-    assert output.getvalue() == b"folder \\u8def \x85\n"
+    command("degrade", "folder 路 …", "none:none")()
+    assert output.getvalue().startswith(b"folder \\u8def \x85\n")
 
 
 def test_a_warning_to_the_user_is_one_line(run_main):

@@ -69,17 +69,19 @@ def select_vehicles(samples: Sequence[LabeledBoxes], labels: Collection[int | st
     Returns:
         As many boxes for each image as the largest number of vehicles; those that it lacks are 0 and have no area.
     """
-    names = {label.lower() if isinstance(label, str) else label for label in labels}
+    names = {*map(_lower, labels)}
     chosen = [
-        sample.boxes
-        if sample.labels is None
-        else sample.boxes[[i for i, x in enumerate(sample.labels) if (x.lower() if isinstance(x, str) else x) in names]]
-        for sample in samples
+        boxes if classes is None else boxes[[i for i, label in enumerate(classes) if _lower(label) in names]]
+        for boxes, classes in samples
     ]
     result = like.new_zeros(len(samples), max(map(len, chosen), default=0), 4)
     for row, boxes in zip(result, chosen, strict=True):
         row[: len(boxes)] = boxes
     return result
+
+
+def _lower(label: int | str) -> int | str:
+    return label.lower() if isinstance(label, str) else label
 
 
 def check_vehicle_labels(labels: Sequence[int | str] | None) -> tuple[int | str, ...] | None:

@@ -19,9 +19,7 @@ from torchrefract._validation import UsageError, check_count, check_number, chec
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import FrameFolder
-from torchrefract.data.images import UnreadableImageError, center_crop, check_frame_of_camera, image_size
-from torchrefract.data.media import describe_turned
+from torchrefract.data.images import UnreadableImageError, center_crop
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.workers import num_cores
 from torchrefract.effects.base import Effect
@@ -192,18 +190,6 @@ def place_scene(cfg: DictConfig, *, size: Sequence[int] | None = None) -> Camera
     for option, value in place.items():
         cfg.scene[option] = value
     return camera
-
-
-def check_drives(camera: Camera, frames: FrameFolder) -> str:
-    """Describe turned frames among the first of each drive; raise UsageError if one has another shape than the camera.
-
-    A drive has one camera.
-    """
-    first = [*dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values()]
-    for frame in first:
-        height, width = image_size(frame)
-        check_frame_of_camera(camera, str(frame), height=height, width=width)
-    return describe_turned(first, upright=True)
 
 
 @contextmanager

@@ -26,7 +26,6 @@ from torchrefract.cli.command import Skipped, batches, check_none_lost, print_wa
 from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
-    check_drives,
     check_seed,
     check_task_options,
     find_device,
@@ -40,11 +39,21 @@ from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
+    check_frame_of_camera,
+    image_size,
     is_lost,
     pixels_of,
     read_image,
 )
-from torchrefract.data.media import describe_losses, find_media, is_complete, is_video, output_name, write_picture
+from torchrefract.data.media import (
+    describe_losses,
+    describe_turned,
+    find_media,
+    is_complete,
+    is_video,
+    output_name,
+    write_picture,
+)
 from torchrefract.data.module import PairData, fingerprint, start_method
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
@@ -245,10 +254,14 @@ def _place_scene(cfg: DictConfig) -> Camera | None:
 
 
 def _check_camera(camera: Camera, data: PairData) -> None:
-    """Check the camera of the frames as `check_drives` does, and warn of frames that a tag turns."""
+    """Raise UsageError if the first frame of a drive has another shape than the camera; warn if a tag turns it."""
     for frames in (data.train, data.val):
         assert isinstance(frames, FrameFolder)  # as `_place_scene` checked
-        if turned := check_drives(camera, frames):
+        first = [*dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values()]
+        for frame in first:
+            height, width = image_size(frame)
+            check_frame_of_camera(camera, str(frame), height=height, width=width)
+        if turned := describe_turned(first, upright=True):
             print_warning(turned)
 
 

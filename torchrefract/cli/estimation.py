@@ -1,7 +1,6 @@
 """The commands that estimate the depth of pictures and videos, and the lens of the camera of a drive."""
 
 import statistics
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import accumulate, count, groupby
 from pathlib import Path
@@ -198,7 +197,7 @@ def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, l
 
 def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> Iterator[Tensor]:
     """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
-    num_read, reason, size = 0, "", None
+    num_read, skipped, size = 0, Skipped(), None
     for file, times in chosen:
         num_before = num_read
         try:
@@ -219,10 +218,9 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             if times and num_read == num_before:
                 raise UnreadableImageError(f"{file} is not a video with a frame that can be decoded")
         except UnreadableImageError as error:
-            reason = str(error)
-            print(f"skipped: {reason}", file=sys.stderr)
+            skipped.add(str(error))
     if num_read == 0:
-        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason}")
+        raise UnreadableImageError(f"input must hold a readable picture or video, got {skipped.errors[-1]}")
 
 
 def _load_network(cfg: DictConfig) -> Predictor:

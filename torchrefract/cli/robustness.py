@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
@@ -22,7 +21,7 @@ import torchrefract
 from torchrefract import random
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, first_names
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.command import Skipped, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_seed,
     depth_folder,
@@ -86,7 +85,7 @@ class _Folder(NamedTuple):
     names: list[str]
     labels: CocoLabels | LabelFolder | None
     depths: DepthFolder | None
-    skipped: list[str]  # why pictures cannot be read
+    skipped: Skipped
     classes: set[int]  # the lowest and highest class of the masks that were read, and the ignored one if they hold it
     place: dict[str, Any]  # arguments of the scenes
     device: torch.device  # of the images, and so of the effects
@@ -109,8 +108,7 @@ class _Folder(NamedTuple):
             try:
                 image = read_image(self.path / name)
             except UnreadableImageError as error:
-                self.skipped.append(str(error))
-                print(f"skipped: {error}", file=sys.stderr)
+                self.skipped.add(str(error))
                 continue
             check_frame_of_camera(self.camera, name, height=image.shape[1], width=image.shape[2])
             with naming("labels"):
@@ -164,8 +162,10 @@ def test_robustness(cfg: DictConfig) -> None:
         try:
             result = evaluate(predict, folder.read(names), scenes, score, **options)
         except RuntimeError as error:
-            if len(folder.skipped) == len(folder.names):
-                raise UsageError(f"data must hold a picture that can be read, got {folder.skipped[0]}") from error
+            if len(folder.skipped.errors) == len(folder.names):
+                raise UsageError(
+                    f"data must hold a picture that can be read, got {folder.skipped.errors[0]}"
+                ) from error
             raise UsageError(f"model: {error}") from error
         except ValueError as error:
             raise UsageError(str(error)) from error
@@ -286,7 +286,7 @@ def _folder(cfg: DictConfig) -> _Folder:
     place = read_place(cfg)
     if (labels or "camera" in place) and (turned := describe_turned([path / name for name in names], upright=True)):
         print_warning(turned)
-    return _Folder(path, names, labels, depths, [], set(), place, find_device(str(cfg.device)))
+    return _Folder(path, names, labels, depths, Skipped(), set(), place, find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:

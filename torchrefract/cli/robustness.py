@@ -156,26 +156,17 @@ def test_robustness(cfg: DictConfig) -> None:
     ):
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
-        names = progress(folder.names, "scoring", count=len(folder.names))
         options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "depth": folder.depth, "done": done}
         options |= {"on_scored": store, "worst_case_draws": num_draws, "batch_size": batch_size}
-        try:
-            result = evaluate(predict, folder.read(names), scenes, score, **options)
-        except RuntimeError as error:
-            if len(folder.skipped.errors) == len(folder.names):
-                raise UsageError(
-                    f"data must hold a picture that can be read, got {folder.skipped.errors[0]}"
-                ) from error
-            raise UsageError(f"model: {error}") from error
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        result = _score(folder, predict, scenes, score, options)
         _check_clean(result, folder)
         about = settings | {
             "metric": _metric(cfg, out / SCORES),
             "torchrefract": torchrefract.__version__,
             "torch": torch.__version__,
         }
-        comparison = base and _compare(result, base, str(cfg.base))
+        with naming("base"):
+            comparison = base and compare_with_base(result, base[1], folder=str(cfg.base), model=base[0])
         write_tables(result, out, about, loss=loss, comparison=comparison)
         examples = [
             _example(name, level, result, folder, predict, scenes, seed) for name, level in _worst(result, num_worst)
@@ -190,9 +181,17 @@ def test_robustness(cfg: DictConfig) -> None:
     _print_failures(result)
 
 
-def _compare(result: Robustness, base: tuple[str, Robustness], folder: str) -> BaseComparison:
-    with naming("base"):
-        return compare_with_base(result, base[1], folder=folder, model=base[0])
+def _score(folder: _Folder, predict: Predict, scenes: Any, score: Any, options: dict[str, Any]) -> Robustness:
+    """Score the pictures of a folder by `evaluate`; its errors become UsageError."""
+    names = progress(folder.names, "scoring", count=len(folder.names))
+    try:
+        return evaluate(predict, folder.read(names), scenes, score, **options)
+    except RuntimeError as error:
+        if len(errors := folder.skipped.errors) == len(folder.names):
+            raise UsageError(f"data must hold a picture that can be read, got {errors[0]}") from error
+        raise UsageError(f"model: {error}") from error
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _print_comparison(comparison: BaseComparison | None, *, has_labels: bool) -> None:

@@ -52,7 +52,7 @@ def claim(
     if path.is_file():
         previous = read_config(path)
         for config in (previous, *map(read_config, shard_configs(out))):
-            if different := _differences({**(earlier or {}), **config.get("settings", {})}, new, "there", "here"):
+            if different := differences({**(earlier or {}), **config.get("settings", {})}, new, "there", "here"):
                 raise UsageError(
                     f"out must be a folder of the same configuration, got {out}, where {different}; choose another "
                     "folder"
@@ -76,7 +76,7 @@ def check_shards(out: Path, settings: Mapping[str, Any], count: int) -> int:
     """
     for path in shard_configs(out):
         config = read_config(path)
-        if different := _differences(config.get("settings", {}), settings, f"in {path.name}", f"in {CONFIG}"):
+        if different := differences(config.get("settings", {}), settings, f"in {path.name}", f"in {CONFIG}"):
             raise UsageError(
                 f"out must hold shards of one configuration, got {out}, where {different}; make each set in a folder "
                 "of its own"
@@ -112,7 +112,7 @@ def _has_valid_values(config: Mapping[str, Any]) -> bool:
     return isinstance(config.get("settings", {}), dict) and isinstance(config.get("count", 0), int)
 
 
-def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
+def differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     """Describe how settings differ; empty if they are equal."""
     before, after = dict(flatten(first)), dict(flatten(second))
     different = [name for name in before | after if before.get(name) != after.get(name)]

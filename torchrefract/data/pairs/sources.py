@@ -16,6 +16,7 @@ from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, check_sizes, evenly_spaced, list_names, select_val_drives, split_frames
 from torchrefract.data.images import EXTENSIONS
 from torchrefract.data.media import VIDEOS
+from torchrefract.data.pairs.configuration import differences
 from torchrefract.data.video import video_info
 from torchrefract.random import key_of
 
@@ -97,9 +98,10 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         previous, skipped = about["options"], about["skipped"]
     except (pa.ArrowInvalid, ValueError, KeyError) as error:
         raise UsageError(f"files must be a list of frames that generate wrote, got {path}") from error
-    if different := [name for name in options if previous.get(name) != options[name]]:
-        shown = ", ".join(f"{name} is {previous.get(name)} there and {options[name]} here" for name in different)
-        raise UsageError(f"files must be a list of the same options, got {path}, where {shown}; choose another folder")
+    if different := differences({name: previous.get(name) for name in options}, options, "there", "here"):
+        raise UsageError(
+            f"files must be a list of the same options, got {path}, where {different}; choose another folder"
+        )
     return Sources(root, table.replace_schema_metadata(), skipped)
 
 
@@ -148,7 +150,7 @@ def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, 
     counts = {path: video_info(root / path)[0] for path in paths}
     frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
     if not frames:
-        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {', '.join(paths[:3])}")
+        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {first_names(paths)}")
     folders = {path: path.rpartition("/")[0] for path in paths}
     drives = folders if len(set(folders.values())) > 1 else {path: path for path in paths}
     drive_of = {f"{path}#{index}": drives[path] for path, index in frames}

@@ -405,11 +405,9 @@ class HeterogeneousFog(PhotometricEffect):
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)
         options = {"dtype": distance.dtype, "device": image.device}
         descent = descent_of_rows(self.horizon, height=height, focal=focal, center=center, **options)
-        scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2)
-        scale = expand_batch(scale, image.shape[0]).view(-1, 1, 1, 1)
-        return mean_density(
-            distance, descent / self._ray_length(distance, image), scale, camera_height=self.camera_height
-        )
+        descent = descent / self._ray_length(distance, image)
+        scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2).view(-1, 1, 1, 1)
+        return mean_density(distance, descent, expand_batch(scale, len(image)), camera_height=self.camera_height)
 
     def _wakes(self, vehicles: Tensor, distance: Tensor, image: Tensor) -> Tensor:
         """Compute (N, 1, H, W): the mean density of the dust behind vehicles along each ray."""

@@ -9,14 +9,14 @@ from matplotlib.image import imsave
 
 from torchrefract._validation import check_range, check_values
 from torchrefract.data.road_scenes import render_road_scenes
-from torchrefract.effects.batch import params_to, per_sample
+from torchrefract.effects.batch import params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 
 
 def flicker(strength: torch.Tensor, *, bands: float, height: int) -> torch.Tensor:
     """Return t = 1 - s sin^2(pi n y / H), (B, 1, H, 1), of s (B,): rows see a lamp at n half periods of the mains."""
     y = torch.arange(height).to(strength) + 0.5
-    return 1 - per_sample(strength) * torch.sin(math.pi * bands * y / height).square().view(-1, 1)
+    return 1 - strength.view(-1, 1, 1, 1) * torch.sin(math.pi * bands * y / height).square().view(-1, 1)
 
 
 class FlickerParams(NamedTuple):

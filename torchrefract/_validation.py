@@ -184,6 +184,14 @@ def finite_or(value: Tensor, default: float) -> Tensor:
     return value.nan_to_num(nan=default, posinf=default, neginf=default)
 
 
+def bounded(value: Tensor, low: float, high: float) -> Tensor:
+    """Clamp values to a range, and replace NaN and infinity by 0, for tensors whose values cannot be checked.
+
+    The clamp leaves a margin, since at the very end of the range it would have no gradient.
+    """
+    return finite_or(value, 0.0).clamp(low - 1e-3 * abs(low) - 1e-6, high + 1e-3 * abs(high))
+
+
 def requires_grad(values: Iterable[Any]) -> bool:
     """Return True if a derivative with respect to one of the tensors may be asked for, in reverse or forward mode.
 

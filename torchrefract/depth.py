@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchrefract._tensor import to_float
 from torchrefract._validation import check_choice, check_positive, check_rgb, is_whole
-from torchrefract.effects.batch import per_sample
 from torchrefract.fields.depth import DepthProvider, GroundPlaneDepth, check_depth
 from torchrefract.fields.sky import sky_mask
 
@@ -99,7 +98,7 @@ class TransformersDepth:
         if self.scale == "model":
             return [ScaledDepth(row, None, None) for row in scaled]
         scale, spread = road_scale(scaled, self.road)
-        rows = zip(scaled * per_sample(scale), scale.tolist(), spread.tolist(), strict=True)
+        rows = zip(scaled * scale.view(-1, 1, 1, 1), scale.tolist(), spread.tolist(), strict=True)
         return [
             ScaledDepth(torch.where(sky, torch.inf, row), factor, width)
             if width <= self.max_spread

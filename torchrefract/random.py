@@ -33,13 +33,13 @@ _BAND = 1 << 17  # numbers whose intermediate results stay in a processor's cach
 class Stream(NamedTuple):
     """Source of the random numbers of each sample: a key of two 32-bit words, and a lane.
 
-    words: (2, B), int64, in [0, 2^32): a NumPy array, or a tensor in a compiled graph or on an accelerator.
+    words: (2, B), int64, in [0, 2^32).
     lane: numbers of different lanes are independent.
     device: device of the drawn numbers; None is that of the words.
     substitute: returns the uniform numbers (B, n) to use instead of those that were drawn, for a search over draws.
     """
 
-    words: np.ndarray | Tensor
+    words: Tensor
     lane: int = 0
     device: torch.device | None = None
     substitute: Callable[["Stream", Tensor], Tensor] | None = None
@@ -88,11 +88,7 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
     """
     if not isinstance(seed, Tensor):
         seed = (seed + 2**63) % 2**64 - 2**63  # two's complement, so that every Python integer has its 64 bits
-    if _can_read(seed, keys):
-        array = np.arange(keys.start, keys.stop) if isinstance(keys, range) else keys.numpy().astype(np.int64)
-        return Stream(_threefry(_halves(np.array([int(seed)])), _halves(array))[:, 0], device=device)
-    if not isinstance(seed, Tensor):
-        seed = torch.full((), seed, dtype=torch.int64, device=None if isinstance(keys, range) else keys.device)
+        seed = torch.full((), seed, dtype=torch.int64, device="cpu" if isinstance(keys, range) else keys.device)
     if torch.compiler.is_compiling() and device is not None and device.type == "cuda":
         # A graph with operations on the CPU waits for them and cannot be recorded as one CUDA graph.
         seed = seed.to(device, non_blocking=True)
@@ -105,8 +101,7 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
 
 def fold(parent: Stream) -> Stream:
     """Return streams for nested draws, independent of those of the parent in any lane."""
-    counters = _counters(parent.words, _WORD, 1, parent.lane)
-    return parent._replace(words=_threefry(parent.words, counters)[:, :, 0], lane=0)
+    return parent._replace(words=_block(parent, _WORD)[:, :, 0], lane=0)
 
 
 def uniform(source: Stream, count: int) -> Tensor:
@@ -122,13 +117,9 @@ def uniform_in_ranges(source: Stream, ranges: Sequence[Range], *, dtype: torch.d
         ranges: n of them.
         dtype: float32 or float64.
     """
-    u = _uniform(source, len(ranges))
-    if isinstance(u, Tensor):
-        low, high = as_device_tensor(ranges, dtype=dtype, device=u.device).view(-1, 2).unbind(1)
-        return _drawn(low + (high - low) * u.to(dtype), source)
-    kind = np.float64 if dtype is torch.float64 else np.float32
-    low, high = np.array(ranges, kind).reshape(-1, 2).T
-    return _drawn(low + (high - low) * u.astype(kind), source)
+    u = _uniform(source, len(ranges)).to(dtype)
+    low, high = as_device_tensor(ranges, dtype=dtype, device=u.device).view(-1, 2).unbind(1)
+    return _drawn(low + (high - low) * u, source)
 
 
 def normal(source: Stream, count: int) -> Tensor:
@@ -136,19 +127,15 @@ def normal(source: Stream, count: int) -> Tensor:
 
     sqrt(-2 ln u1) cos(2 pi u2) for all pairs, then sqrt(-2 ln u1) sin(2 pi u2)
     """
-    u = _uniform(source, 2 * _num_blocks(count))
-    radius, angle = (u if isinstance(u, Tensor) else torch.from_numpy(u)).chunk(2, dim=1)
+    radius, angle = _uniform(source, count + count % 2).chunk(2, dim=1)
     radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
     return _drawn(torch.cat([radius * angle.cos(), radius * angle.sin()], dim=1)[:, :count].contiguous(), source)
 
 
 def noise_key(source: Stream) -> Tensor:
     """Draw (B, 4), int64, in [0, 2^32): the key of each sample's white noise."""
-    child = fold(source).words
-    more = _threefry(child, _counters(child, 0, 1, 0))[:, :, 0]
-    if isinstance(child, Tensor):
-        return _drawn(torch.cat([child, more]).T.contiguous(), source)
-    return _drawn(np.concatenate([child, more]).T.copy(), source)
+    child = fold(source)
+    return _drawn(torch.cat([child.words, _block(child, 0)[:, :, 0]]).T.contiguous(), source)
 
 
 def white_noise(key: Tensor, count: int, *, start: int = 0) -> Tensor:
@@ -206,19 +193,14 @@ def call_seed() -> Tensor:
     return torch.ops.torchrefract.call_seed.default() if torch.compiler.is_compiling() else _new_seed()
 
 
-def _can_read(seed: int | Tensor, keys: Tensor | range) -> bool:
-    tensors = [value for value in (seed, keys) if isinstance(value, Tensor)]
-    return not torch.compiler.is_compiling() and not any(map(why_not_eager, tensors))
-
-
-def _threefry(keys: Any, counters: Any) -> Any:
+def _threefry(keys: Tensor, counters: Tensor) -> Tensor:
     """Compute the two words (2, B, n) of n counters (2, n) under each of B keys (2, B), all int64 in [0, 2^32)."""
-    if isinstance(keys, Tensor):
-        if torch.compiler.is_compiling():
-            return torch.ops.torchrefract.threefry(keys, counters)
-        return torch.stack(_rounds(*keys[:, :, None], *counters))
-    # NumPy starts each of the hundred operations several times as fast as PyTorch.
-    return np.stack(_rounds(*keys[:, :, None], *counters))
+    if torch.compiler.is_compiling():
+        return torch.ops.torchrefract.threefry(keys, counters)
+    if why_not_eager(counters) is None:
+        # NumPy starts each of the hundred operations several times as fast as PyTorch.
+        return torch.from_numpy(np.stack(_rounds(*keys.numpy()[:, :, None], *counters.numpy())))
+    return torch.stack(_rounds(*keys[:, :, None], *counters))
 
 
 @torch.library.custom_op("torchrefract::threefry", mutates_args=())
@@ -247,43 +229,30 @@ def _rounds(key0: Any, key1: Any, counter0: Any, counter1: Any) -> tuple[Any, An
     return x, y & _WORD
 
 
-def _halves(values: Any) -> Any:
+def _halves(values: Tensor) -> Tensor:
     """Split (B,) integers of 64 bits into words (2, B), the high ones first."""
-    parts = [(values >> 32) & _WORD, values & _WORD]
-    return torch.stack(parts) if isinstance(values, Tensor) else np.stack(parts)
+    return torch.stack([(values >> 32) & _WORD, values & _WORD])
 
 
-def _counters(like: Any, first: int, count: int, lane: int) -> Any:
-    """Create (2, count) counters: consecutive numbers, and the lane."""
-    if isinstance(like, Tensor):
-        index = torch.arange(first, first + count, device=like.device)
-        return torch.stack([index, torch.full_like(index, lane)])
-    return np.array([range(first, first + count), [lane] * count], np.int64)
+def _block(source: Stream, first: int, count: int = 1) -> Tensor:
+    """Compute the words (2, B, count) of consecutive counters in the lane of a stream."""
+    index = torch.arange(first, first + count, device=source.words.device)
+    return _threefry(source.words, torch.stack([index, torch.full_like(index, source.lane)]))
 
 
-def _num_blocks(count: int) -> int:
-    """Return how many counters are needed: each gives two words."""
-    return (count + 1) // 2
-
-
-def _uniform(source: Stream, count: int) -> Any:
+def _uniform(source: Stream, count: int) -> Tensor:
     """Compute `uniform` numbers from the first words of all counters, and then their second words."""
-    first, second = _threefry(source.words, _counters(source.words, 0, _num_blocks(count), source.lane))
     if source.substitute is not None:
-        drawn = _uniform(source._replace(substitute=None), count)
-        return source.substitute(source, drawn if isinstance(drawn, Tensor) else torch.from_numpy(drawn))
-    if isinstance(first, Tensor):
-        return (torch.cat([first, second], dim=1)[:, :count] >> 9).float().add(0.5).mul(2.0**-23)
-    # Exact in float64, and then in float32: the numbers have 24 bits.
-    return (((np.concatenate([first, second], axis=1)[:, :count] >> 9) + 0.5) * 2.0**-23).astype(np.float32)
+        return source.substitute(source, _uniform(source._replace(substitute=None), count))
+    words = torch.cat(_block(source, 0, (count + 1) // 2).unbind(), dim=1)[:, :count]
+    return (words >> 9).float().add(0.5).mul(2.0**-23)  # exact, since the numbers have 24 bits
 
 
-def _drawn(values: Any, source: Stream) -> Tensor:
-    """Return the values as a tensor on the device of a stream; a copy from the CPU waits for nothing."""
-    tensor = values if isinstance(values, Tensor) else torch.from_numpy(values)
-    if source.device is None or source.device == tensor.device:
-        return tensor
-    return tensor.to(source.device, non_blocking=tensor.device.type == "cpu")
+def _drawn(values: Tensor, source: Stream) -> Tensor:
+    """Return the values on the device of a stream; a copy from the CPU waits for nothing."""
+    if source.device is None or source.device == values.device:
+        return values
+    return values.to(source.device, non_blocking=values.device.type == "cpu")
 
 
 def _hash(index: Tensor, a: Tensor, b: Tensor) -> Tensor:

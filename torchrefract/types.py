@@ -19,9 +19,6 @@ from torch import Tensor
 Range = tuple[float, float]
 Map = Tensor | Callable[[], Tensor]
 
-# Maps of Degraded that photometric effects give.
-_LIGHT = ("transmission", "extinction", "intensity")
-
 
 class Inverse(NamedTuple):
     """Inverse of a flow."""
@@ -131,42 +128,15 @@ class Degraded:
 
     Args:
         image, params: see above.
-        valid, flow, light: maps, or functions that compute them; `light` by name.
-        restore: computes the inverse flow from this result.
-        restore_valid: computes the map from this result and the validity of the inverse flow.
-        residual, folding: compute the map from this result.
+        maps: functions that compute the maps from this result, by name; "restore_flow" is an `Inverse`.
     """
 
-    def __init__(
-        self,
-        image: Tensor,
-        params: Any,
-        *,
-        valid: Map,
-        flow: Map | None = None,
-        restore: Callable[["Degraded"], Inverse] | None = None,
-        restore_valid: Callable[["Degraded", Tensor], Tensor] | None = None,
-        residual: Callable[["Degraded"], Tensor] | None = None,
-        folding: Callable[["Degraded"], Folding] | None = None,
-        light: Mapping[str, Map] | None = None,
-    ):
+    def __init__(self, image: Tensor, params: Any, maps: Mapping[str, Callable[["Degraded"], Any]]):
         self.image = image
         self.params = params
-        # Values, or functions of this result. Passing the result avoids a reference cycle, so that memory is freed at
-        # once. torch.compile does not support the lock of functools.cached_property.
-        self._maps: dict[str, Any] = {
-            "valid": _from_result(valid),
-            "flow": _from_result(flow),
-            "restore_flow": restore,
-            "restore_valid": None
-            if restore_valid is None
-            else lambda d: restore_valid(d, d._read("restore_flow").valid),
-            "restore_residual": residual,
-            "folding": folding,
-            **dict.fromkeys(_LIGHT),
-        }
-        for name, value in (light or {}).items():
-            self._maps[name] = _from_result(value)
+        # Values take the place of the functions. Passing the result to these avoids a reference cycle, so that memory
+        # is freed at once. torch.compile does not support the lock of functools.cached_property.
+        self._maps: dict[str, Any] = dict(maps)
 
     @property
     def valid(self) -> Tensor:
@@ -199,10 +169,14 @@ class Degraded:
         return self._read("intensity")
 
     @property
+    def inverse(self) -> Any:
+        """Return the inverse of the flow, and where it exists."""
+        return self._read("restore_flow")
+
+    @property
     def restore_flow(self) -> Any:
         """Return the inverse of the flow, px."""
-        restored = self._read("restore_flow")
-        return None if restored is None else restored.flow
+        return None if self.inverse is None else self.inverse.flow
 
     @property
     def restore_valid(self) -> Any:
@@ -216,28 +190,19 @@ class Degraded:
 
     def has(self, name: str) -> bool:
         """Return True if the effect has this map, without computing it."""
-        return self._maps[name] is not None
+        return name in self._maps
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Degraded":
         """Return a copy with `function` applied to each map, lazily; image and params stay."""
 
-        def later(name: str, mapped: Callable[[Any], Any] = function) -> Any:
-            return None if self._maps[name] is None else lambda *_: mapped(self._read(name))
+        def mapped(name: str) -> Any:
+            value = self._read(name)
+            return type(value)(*map(function, value)) if isinstance(value, tuple) else function(value)
 
-        return Degraded(
-            self.image,
-            self.params,
-            valid=lambda: function(self.valid),
-            flow=later("flow"),
-            restore=later("restore_flow", lambda restored: Inverse(*map(function, restored))),
-            restore_valid=later("restore_valid"),
-            residual=later("restore_residual"),
-            folding=later("folding", lambda folding: Folding(*map(function, folding))),
-            light={name: value for name in _LIGHT if (value := later(name)) is not None},
-        )
+        return Degraded(self.image, self.params, {name: lambda _, name=name: mapped(name) for name in self._maps})
 
     def _read(self, name: str) -> Any:
-        value = self._maps[name]
+        value = self._maps.get(name)
         if callable(value):
             device = self.image.device.type
             is_autocast = device != "meta" and torch.is_autocast_enabled(device)
@@ -249,8 +214,3 @@ class Degraded:
     def __getstate__(self) -> dict[str, Any]:
         """Compute all maps, since functions cannot be pickled."""
         return self.__dict__ | {"_maps": {name: self._read(name) for name in self._maps}}
-
-
-def _from_result(value: Map | None) -> Any:
-    """Return a map's function as a function of the result."""
-    return (lambda _: value()) if callable(value) else value

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrefract.ops.sampling import PADDINGS, grid_sample, sample, sample_lattice
+from torchrefract.ops.sampling import PADDINGS, grid_sample, sample
 
 SIZES = [(1, 40), (40, 1), (2, 2), (150, 131)]
 needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="needs numba")
@@ -59,8 +59,8 @@ def test_numba_agrees_with_torch_along_flows_on_lattices(stride, padding):
     for margin in (1, 2):
         nodes = random_nodes(2, 150, 131, stride, margin)
         options = {"stride": stride, "margin": margin, "padding": padding, "interpolation": "bilinear"}
-        reference = sample_lattice(image.double(), nodes, backend="torch", **options)
-        assert_agree(sample_lattice(image, nodes, backend="numba", **options), image, reference)
+        reference = sample(image.double(), nodes, backend="torch", **options)
+        assert_agree(sample(image, nodes, backend="numba", **options), image, reference)
 
 
 @needs_numba
@@ -101,7 +101,7 @@ def test_inactive_samples_are_copied(backend, dtype):
     image, nodes = random_image(3, 2, 40, 50, dtype=dtype), random_nodes(1, 40, 50, 8)
     active = torch.tensor([False, True, False])
     options = {"stride": 8, "margin": 1, "padding": "zeros", "interpolation": "bilinear", "backend": backend}
-    result, full = sample_lattice(image, nodes, active=active, **options), sample_lattice(image, nodes, **options)
+    result, full = sample(image, nodes, active=active, **options), sample(image, nodes, **options)
     assert torch.equal(result[[0, 2]], image[[0, 2]])
     assert torch.equal(result[1], full[1])
     assert not torch.equal(result[1], image[1])
@@ -113,9 +113,9 @@ def test_numba_gives_the_same_image_on_any_number_of_threads(on_threads, threads
     image, nodes = random_image(1, 3, 300, 280), random_nodes(1, 300, 280, 16)
     options = {"stride": 16, "margin": 1, "padding": "zeros", "interpolation": "bilinear", "backend": "numba"}
     on_threads(2)
-    expected = sample_lattice(image, nodes, **options)
+    expected = sample(image, nodes, **options)
     on_threads(threads)
-    assert torch.equal(sample_lattice(image, nodes, **options), expected)
+    assert torch.equal(sample(image, nodes, **options), expected)
 
 
 def _sample_in_child(connection, image: Tensor, flow: Tensor) -> None:
@@ -158,8 +158,8 @@ def test_triton_agrees_with_torch_in_its_interpreter():
 def test_triton_agrees_with_torch_on_a_gpu(padding, dtype):
     image, nodes = random_image(6, 3, 270, 480, dtype=dtype).cuda(), random_nodes(6, 270, 480, 16).cuda()
     options = {"stride": 16, "margin": 1, "padding": padding, "interpolation": "bilinear"}
-    difference = sample_lattice(image, nodes, backend="triton", **options).double()
-    difference -= sample_lattice(image, nodes, backend="torch", **options).double()
+    difference = sample(image, nodes, backend="triton", **options).double()
+    difference -= sample(image, nodes, backend="torch", **options).double()
     assert difference.abs().max() <= {torch.float32: 2e-4, torch.float16: 1e-3, torch.uint8: 1}[dtype]
 
 
@@ -168,7 +168,7 @@ def test_torch_serves_where_a_gradient_is_needed():
     image, nodes = random_image(1, 2, 130, 140), random_nodes(1, 130, 140, 8).requires_grad_()
     for backend in ("auto", "numba"):
         options = {"stride": 8, "margin": 1, "padding": "border", "interpolation": "bilinear", "backend": backend}
-        sample_lattice(image, nodes, **options).sum().backward()
+        sample(image, nodes, **options).sum().backward()
         assert nodes.grad is not None
         assert nodes.grad.abs().sum() > 0
 

@@ -5,7 +5,7 @@ import json
 
 import torch
 
-from torchrefract.ops.sampling import lagrange_weights, sample_lattice
+from torchrefract.ops.sampling import lagrange_weights, sample
 
 # The interpreter runs Python, not a kernel that a compiler could see into.
 torch.library.wrap_triton = lambda kernel: kernel
@@ -30,9 +30,7 @@ def error(flows: int, margin: int, channels: int, layout: torch.memory_format, p
     weights = lagrange_weights(STRIDE, dtype=torch.float32, device=image.device)
     options = {"margin": margin, "padding": padding, "active": active}
     sampled = triton_gpu.sample_lattice(image, nodes, weights, limit=1e4, **options)
-    reference = sample_lattice(
-        image.double(), nodes, stride=STRIDE, interpolation="bilinear", backend="torch", **options
-    )
+    reference = sample(image.double(), nodes, stride=STRIDE, interpolation="bilinear", backend="torch", **options)
     assert sampled.is_contiguous(memory_format=layout)
     assert active is None or torch.equal(sampled[1], image[1])
     return (sampled - reference).abs().max().item()

@@ -56,7 +56,7 @@ from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.video import convert_video
 from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
-from torchrefract.effects.vehicles import uses_boxes, with_vehicles
+from torchrefract.effects.batch import uses_boxes, with_vehicles
 from torchrefract.random import key_of
 from torchrefract.types import Degraded
 

@@ -37,8 +37,9 @@ from torchrefract.effects.batch import (
     params_at_frames,
     promote_params,
     to_batch,
+    uses_boxes,
+    with_vehicles,
 )
-from torchrefract.effects.vehicles import uses_boxes, with_vehicles
 from torchrefract.fields.depth import DepthSource, depth_of
 from torchrefract.labels.plain_values import name_of
 from torchrefract.labels.targets import is_tv_tensor, warp_moved_labels, wrap_like
@@ -76,6 +77,7 @@ class Effect(nn.Module, ABC):
 
     params_type: type[Any]
     labels_getter: str | Callable[[Any], Any] | None = "default"
+    keeps_uint8: bool = False  # whether `degrade_batch` accepts uint8 images as they are
     depth: DepthSource | None = None  # of frames without a depth map; None for an effect that depends on no depth
 
     def __init__(self, *, p: float = 1.0):
@@ -274,11 +276,6 @@ class Effect(nn.Module, ABC):
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> Any:
         """Return the plan for flows or maps of a type, from the ranges alone."""
 
-    @property
-    def keeps_uint8(self) -> bool:
-        """Return True if `degrade_batch` accepts uint8 images as they are."""
-        return False
-
     @abstractmethod
     def sample_params(self, stream: random.Stream, image: Tensor) -> Any:
         """Draw parameters for images (B, C, H, W) from the random streams of the samples; a `frame` is 0."""
@@ -291,9 +288,13 @@ class Effect(nn.Module, ABC):
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Degrade images (N, C, H, W), floating or uint8 if `keeps_uint8`, with valid parameters of B samples."""
 
+    def active(self, params: Any) -> Tensor:
+        """Return (B,), bool: the samples that change."""
+        return params.applied & ~params.is_identity
+
     def may_change(self, params: Any) -> bool:
         """Return False if no sample changes; True if one does, if that cannot be read, or if gradients are needed."""
-        active = params.applied & ~params.is_identity
+        active = self.active(params)
         return len(active) > 0 and (eager_values(active.any, of=active) is not False or requires_grad(params))
 
     def check_params(self, params: Any, image: Tensor) -> None:
@@ -306,8 +307,8 @@ class Effect(nn.Module, ABC):
         if not isinstance(params, self.params_type):
             raise TypeError(f"params must be {self.params_type.__name__}, got {type(params).__name__}")
         for name, value in zip(params._fields, params, strict=True):
-            if value is None and name in params._field_defaults:
-                continue
+            if name == "children" or (value is None and name in params._field_defaults):
+                continue  # a composition checks the parameters of its effects in `validate`
             if not isinstance(value, Tensor) or value.ndim == 0 or value.shape[0] != image.shape[0]:
                 got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
                 raise ValueError(f"params.{name} must have one row for each of the {image.shape[0]} images, got {got}")

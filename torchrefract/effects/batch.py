@@ -5,16 +5,17 @@ of a clip keeps B rows until it meets one that is not.
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrefract._tensor import expand_batch, is_channels_last, to_float, to_uint8
 from torchrefract._validation import check_tensor, check_within, eager_values, requires_grad, warn, why_not_eager
 from torchrefract.labels.targets import is_tv_tensor
+from torchrefract.labels.vehicles import LabeledBoxes, select_vehicles
 from torchrefract.warping.grid import field_dtype
 
 _MOST_CHANNELS = 4  # of usual images; a clip of 3 frames with more is likely (B, C, T, H, W)
@@ -301,16 +302,6 @@ def rows_of_samples(index: Tensor, frames: int) -> Tensor:
     return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()
 
 
-def per_sample(flags: Tensor) -> Tensor:
-    """View (N,) as (N, 1, 1, 1)."""
-    return flags.view(-1, 1, 1, 1)
-
-
-def frame_mean(value: Tensor) -> Tensor:
-    """Return (N, C, 1, 1), the mean of (N, C, H, W) over the frame."""
-    return value.mean(dim=(2, 3), keepdim=True)
-
-
 class _SwapGradient(torch.autograd.Function):
     """Return the first tensor, and pass the gradient to the second."""
 
@@ -359,3 +350,24 @@ def where_active(changed: Tensor, unchanged: Tensor | float, active: Tensor, par
     differentiable = torch.where(expand_batch(params.applied, rows).view(shape), changed, unchanged)
     swap = _SwapGradient if torch.compiler.is_compiling() else _SwapGradientForward
     return cast(Tensor, swap.apply(value.detach(), differentiable))
+
+
+def uses_boxes(effect: nn.Module) -> bool:
+    """Return True if an effect, or one of a composition, depends on boxes of vehicles."""
+    return any(getattr(part, "vehicle_labels", None) is not None for part in effect.modules())
+
+
+def with_vehicles(effect: Any, params: Any, boxes: Sequence[LabeledBoxes]) -> Any:
+    """Return the parameters of an effect with the vehicles that the boxes of each image show.
+
+    Args:
+        effect: of the parameters; a composition hands the boxes to its effects as they are, so dust comes before warps.
+        params: of the effect, with B rows.
+        boxes: of each of the B images.
+    """
+    if hasattr(params, "children"):
+        pairs = zip(effect.effects, params.children, strict=True)
+        return params._replace(children=tuple(with_vehicles(part, child, boxes) for part, child in pairs))
+    if getattr(effect, "vehicle_labels", None) is None:
+        return params
+    return params._replace(vehicles=select_vehicles(boxes, effect.vehicle_labels, like=params.visibility))

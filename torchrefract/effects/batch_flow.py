@@ -21,10 +21,10 @@ from torch.utils import _pytree as pytree
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import eager_values, requires_grad
-from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
+from torchrefract.effects.batch import rows_of_samples, select_params, where_active
 from torchrefract.planning.plan import PlanRequest, WarpPlan, plan_warp
-from torchrefract.warping.grid import Points
-from torchrefract.warping.lattice import Lattice, LatticeFlow, lattice_around, pixel_lattice, within_reach
+from torchrefract.warping.grid import Points, inside
+from torchrefract.warping.lattice import LatticeFlow, lattice_around, lattice_with_stride, pixel_lattice, within_reach
 from torchrefract.warping.warp import sample_image
 
 COARSEST = 64  # px, stride of the first lattice that is measured
@@ -85,12 +85,7 @@ class WarpFlow:
                 nodes = lattice.points(dtype=points.x.dtype, device=points.x.device)
                 self._field = LatticeFlow(self.evaluate(self.params, nodes, self.plan)[0], lattice)
             flow, exists = self._field.at(points), everywhere(self.active.device)
-        return self.masked(flow, exists)
-
-    def masked(self, flow: Tensor, exists: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the flow, zero for samples that do not move, and where it exists."""
-        active = expand_batch(self.active, len(flow))
-        return where_active(flow, 0.0, active, self.params), exists | ~per_sample(active)
+        return masked_flow(flow, exists, self.active, self.params)
 
     def exact(self) -> "WarpFlow":
         """Return the flow without a tolerance."""
@@ -105,6 +100,12 @@ class WarpFlow:
             nodes = expand_batch(self._field.nodes, len(self.active))[rows]
             selected._field = LatticeFlow(nodes, self._field.lattice)
         return selected
+
+
+def masked_flow(flow: Tensor, exists: Tensor, active: Tensor, params: Any) -> tuple[Tensor, Tensor]:
+    """Return a flow (N, 2, h, w), zero for samples that are not active, (N,) or (B,), and where it exists."""
+    active = expand_batch(active, len(flow))
+    return where_active(flow, 0.0, active, params), exists | ~active.view(-1, 1, 1, 1)
 
 
 class ComposedFlow(NamedTuple):
@@ -141,13 +142,6 @@ class FlowPart(NamedTuple):
         return self._replace(samples=samples if self.samples is None else samples[self.samples])
 
 
-def flow_at_nodes(warp: WarpFlow, lattice: Lattice) -> FlowPart:
-    """Compute the flow of one warp at the nodes of a lattice, as its plan says."""
-    points = lattice.points(dtype=flow_dtype(warp.params), device=warp.active.device)
-    flow, exists = warp.masked(*warp.evaluate(warp.params, points, warp.plan))
-    return FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))
-
-
 def flow_on_measured_lattice(
     warps: Sequence[WarpFlow], *, stride: int, is_smooth: bool = True, tolerance_px: float
 ) -> list[FlowPart]:
@@ -162,7 +156,7 @@ def flow_on_measured_lattice(
     height, width = warps[0].plan.height, warps[0].plan.width
     while stride > max(1, min(height, width) // _FEWEST_CELLS):
         stride //= 2
-    lattice = pixel_lattice(height, width) if stride == 1 else Lattice(height, width, stride, _MARGIN)
+    lattice = lattice_with_stride(height, width, stride, margin=_MARGIN)
     composed = compose_at(warps, lattice.points(dtype=flow_dtype(warps[0].params), device=warps[0].active.device))
     if stride == 1:
         return [FlowPart(None, LatticeFlow(composed.flow, lattice), composed.exists)]
@@ -282,11 +276,6 @@ class BatchFlow:
         return sum(len(part.flow.nodes) for part in self.parts)
 
     @property
-    def is_zero(self) -> bool:
-        """Return True if no flow was computed, because none exceeds the tolerance."""
-        return all(part.is_zero for part in self.parts)
-
-    @property
     def dense(self) -> Tensor:
         """Return (N, 2, H, W), px."""
         # torch.compile cannot trace the lock of functools.cached_property.
@@ -304,6 +293,11 @@ class BatchFlow:
             [part.exists.expand(len(part.flow.nodes), 1, size.height, size.width) for part in self.parts]
         )
 
+    def leads_inside(self, active: Tensor) -> Tensor:
+        """Return (N, 1, H, W), bool: the flow leads into the frame, or the sample is not active, (N,) or (B,)."""
+        active = expand_batch(active, self.num_rows)
+        return (self.exists & inside(self.dense)) | ~active.view(-1, 1, 1, 1)
+
     def detach(self) -> "BatchFlow":
         """Return the flows without gradients."""
         return BatchFlow([part._replace(flow=part.flow.detach()) for part in self.parts])
@@ -316,27 +310,25 @@ class BatchFlow:
             params: with `applied`; the gradient of applied samples is kept at strength zero.
             options: all decided.
         """
-        chosen = options._asdict()
-        if requires_grad([part.flow.nodes for part in self.parts]):
-            # Samples that do not move need the gradient of their parameters.
-            return where_active(self._sample(image, None, chosen), image, active, params)
-        return self._sample(image, None if eager_values(active.all, of=active) else active, chosen)
+        # Samples that do not move need the gradient of their parameters.
+        has_gradient = requires_grad([part.flow.nodes for part in self.parts])
+        mask = None if has_gradient or eager_values(active.all, of=active) else active
 
-    def _sample(self, image: Tensor, active: Tensor | None, options: dict[str, Any]) -> Tensor:
+        def sampled(part: Tensor, flow: LatticeFlow, mask: Tensor | None) -> Tensor:
+            each = LatticeFlow(expand_batch(flow.nodes, len(part)), flow.lattice)
+            return sample_image(part, each, active=mask, **options._asdict())
+
         if len(self.parts) == 1:
-            flow = self.parts[0].flow
-            flow = LatticeFlow(expand_batch(flow.nodes, image.shape[0]), flow.lattice)
-            return sample_image(image, flow, active=active, **options)
-        result = torch.empty_like(image)
-        frames = image.shape[0] // self.num_rows
-        for index, flow, *_ in self.parts:
-            assert index is not None  # of several parts
-            rows = rows_of_samples(index, frames * len(flow.nodes) // len(index))
-            each = LatticeFlow(expand_batch(flow.nodes, len(rows)), flow.lattice)
-            part = sample_image(image[rows], each, active=None if active is None else active[rows], **options)
-            # Forward-mode gradients cannot be written into a tensor without any.
-            result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
-        return result
+            result = sampled(image, self.parts[0].flow, mask)
+        else:
+            result = torch.empty_like(image)
+            for index, flow, *_ in self.parts:
+                assert index is not None  # of several parts
+                rows = rows_of_samples(index, len(image) // self.num_rows * len(flow.nodes) // len(index))
+                part = sampled(image[rows], flow, None if mask is None else mask[rows])
+                # Forward-mode gradients cannot be written into a tensor without any.
+                result = (result.index_copy if requires_grad((part,)) else result.index_copy_)(0, rows, part)
+        return where_active(result, image, active, params) if has_gradient else result
 
     def _gather(self, values: Sequence[Tensor]) -> Tensor:
         if len(values) == 1:

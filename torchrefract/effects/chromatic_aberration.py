@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_choice, check_range, check_within, finite_or
+from torchrefract._validation import bounded, check_choice, check_range, check_within
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -86,8 +86,7 @@ class ChromaticAberration(PhotometricEffect):
     def render(self, image: Tensor, params: ChromaticAberrationParams, depth: Tensor | None) -> Rendered:
         """Scale the first and the last channel of images."""
         height, width = image.shape[2:]
-        # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
-        scale = finite_or(params.scale.to(field_dtype(image.dtype)), 0.0).clamp(-2 * _LARGEST_SCALE, 2 * _LARGEST_SCALE)
+        scale = bounded(params.scale.to(field_dtype(image.dtype)), -_LARGEST_SCALE, _LARGEST_SCALE)
         center = pinhole_of(self.camera, height=height, width=width).center
         red, blue = (
             scale_about(each, center, height=height, width=width) for each in expand_batch(scale, len(image)).unbind(1)

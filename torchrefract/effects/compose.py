@@ -12,7 +12,7 @@ from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
 from torchrefract._validation import check_choice, check_number, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import check_applied, params_per_frame, params_to, select_params
+from torchrefract.effects.batch import params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
 from torchrefract.effects.progress import Leaf, Progress
 from torchrefract.effects.warp_effect import WarpEffect
@@ -88,7 +88,7 @@ class Compose(Effect):
         self.tolerance_px = check_tolerance(tolerance_px)
 
     @property
-    def keeps_uint8(self) -> bool:
+    def keeps_uint8(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # follows from the effects
         """Return True if all effects do."""
         return all(effect.keeps_uint8 for effect in self.effects)
 
@@ -112,13 +112,6 @@ class Compose(Effect):
             )
         for effect, child in zip(self.effects, params.children, strict=True):
             effect.check_params(child, image)
-
-    def check_params(self, params: Any, image: Tensor) -> None:
-        """Raise for parameters that do not belong to these effects and this batch."""
-        if not isinstance(params, ComposeParams):
-            raise TypeError(f"params must be ComposeParams, got {type(params).__name__}")
-        check_applied(params.applied, len(image))
-        self.validate(params, image)
 
     def for_params(self, params: ComposeParams, height: int, width: int) -> "Compose":
         """Return the composition with an exact effect wherever parameters lie outside the ranges."""
@@ -157,26 +150,25 @@ class Compose(Effect):
         """Pass the images through all effects."""
         height, width = image.shape[2:]
         requests = self._requests(id(self), height, width, field_dtype(image.dtype))
-        leaves = self._leaves(params, SamplingOptions())
         progress = Progress(image, depth, len(params.applied))
-        together: list[int] = []  # the places of warps that will be sampled together
-        for place, leaf in enumerate(leaves):
+        together: list[Leaf] = []  # warps that will be sampled together
+        for leaf in self._leaves(params):
             if isinstance(leaf.effect, WarpEffect):
                 progress.has_warps = True
                 if leaf.effect.may_change(leaf.params) and height * width > 1:
-                    together.append(place)
+                    together.append(leaf)
                 continue
-            if together and (requests[place] is None or leaf.effect.may_change(leaf.params)):
-                self._move(progress, leaves, together, requests)  # the warps before it come first
+            if together and (requests[leaf.place] is None or leaf.effect.may_change(leaf.params)):
+                self._move(progress, together, requests)  # the warps before it come first
                 together = []
             progress.shade(leaf.effect, leaf.params)
         if together:
-            self._move(progress, leaves, together, requests)
+            self._move(progress, together, requests)
         return progress.result(params)
 
     def effects_with_params(self, params: ComposeParams) -> Iterator[tuple[Effect, Any]]:
         """Yield the effects that are not compositions, in order, with their parameters."""
-        for leaf in self._leaves(params, SamplingOptions()):
+        for leaf in self._leaves(params):
             yield leaf.effect, leaf.params
 
     def _flat_effects(self) -> list[Any]:
@@ -186,30 +178,29 @@ class Compose(Effect):
             effects += effect._flat_effects() if isinstance(effect, Compose) else [effect]
         return effects
 
-    def _leaves(self, params: ComposeParams, outer: SamplingOptions) -> list[Leaf]:
-        """Return `_flat_effects` with their parameters, and with the options of the compositions around them first."""
-        options = outer.or_else(self)
+    def _leaves(self, params: ComposeParams, outer: SamplingOptions | None = None, first: int = 0) -> list[Leaf]:
+        """Return `_flat_effects` with their parameters, and with the options of the compositions around them first.
+
+        Args:
+            params: of the composition.
+            outer: options of the compositions around this one; None for none.
+            first: place of its first effect.
+        """
+        options = (outer or SamplingOptions()).or_else(self)
         leaves: list[Leaf] = []
         for effect, child in zip(self.effects, params.children, strict=True):
             if isinstance(effect, Compose):
-                leaves += effect._leaves(child, options)
+                leaves += effect._leaves(child, options, first + len(leaves))
             else:
                 decided = options.or_else(effect) if isinstance(effect, WarpEffect) else options
-                leaves.append(Leaf(effect, child, decided))
+                leaves.append(Leaf(effect, child, decided, first + len(leaves)))
         return leaves
 
-    def _move(
-        self,
-        progress: Progress,
-        leaves: Sequence[Leaf],
-        places: Sequence[int],
-        requests: Sequence[PlanRequest | None],
-    ) -> None:
-        """Sample the images along the composed flow of the warps at some places."""
-        request = cast(PlanRequest, requests[places[0]])
-        frame = request.height, request.width
-        moving = self._at_depth(progress, [leaves[k] for k in places], places, request)
-        active = [leaf.effect.active(leaf.params, *frame) for leaf in moving]
+    def _move(self, progress: Progress, warps: Sequence[Leaf], requests: Sequence[PlanRequest | None]) -> None:
+        """Sample the images along the composed flow of warps."""
+        request = cast(PlanRequest, requests[warps[0].place])
+        moving = self._at_depth(progress, warps, request)
+        active = [leaf.effect.active(leaf.params) for leaf in moving]
         moments = [leaf.effect.moments() for leaf in moving]
         parts = []
         for k in range(max(map(len, moments))):
@@ -217,23 +208,17 @@ class Compose(Effect):
                 leaf if len(each) == 1 else leaf._replace(params=leaf.params.at(each[k % len(each)]))
                 for leaf, each in zip(moving, moments, strict=True)
             ]
-            parts.append(self._parts(looks, places, active, request))
-        middle = parts[0] if len(parts) == 1 else self._parts(moving, places, active, request)
+            parts.append(self._parts(looks, active, request))
+        middle = parts[0] if len(parts) == 1 else self._parts(moving, active, request)
         # The share must not depend on the warps that move other samples of the batch. Of several warps it is half as
         # large, since the inverse of one stretches the errors of the others.
-        num_warps = sum(isinstance(leaf.effect, WarpEffect) for leaf in leaves)
+        num_warps = sum(isinstance(effect, WarpEffect) for effect in self._flat_effects())
         num_shares = num_warps if num_warps == 1 else 2 * num_warps
         share_px = None if request.tolerance_px is None else request.tolerance_px / num_shares
         progress.move(moving, active, middle, share_px, exposures=parts)
 
     def _parts(
-        self,
-        moving: Sequence[Leaf],
-        places: Sequence[int],
-        active: Sequence[Tensor],
-        request: PlanRequest,
-        *,
-        can_measure: bool = True,
+        self, moving: Sequence[Leaf], active: Sequence[Tensor], request: PlanRequest, *, can_measure: bool = True
     ) -> list[FlowPart]:
         """Compute the composed flow of warps; arguments as for `Progress.move` and `_at_depth`."""
         frame = request.height, request.width
@@ -242,38 +227,36 @@ class Compose(Effect):
         parts: list[FlowPart] = []
         for samples, acting in _group_samples(active) if can_group else [(None, list(range(len(moving))))]:
             chosen = [moving[k] for k in acting]
-            exact_places = tuple([places[k] for k in acting if moving[k].effect.must_be_exact(moving[k].params)])
             if samples is not None:
                 chosen = [leaf._replace(params=select_params(leaf.params, samples)) for leaf in chosen]
-            acting_places = tuple([places[k] for k in acting])
+            places = tuple([leaf.place for leaf in chosen])
+            exact_places = tuple([leaf.place for leaf in chosen if leaf.effect.must_be_exact(leaf.params)])
             plan = self._constant_plan(
-                id(self), acting_places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
+                id(self), places, exact_places, *frame, request.tolerance_px, request.is_double, can_measure
             )
             parts += [part.of_samples(samples) for part in _composed_flow(chosen, plan, request.tolerance_px)]
         return parts
 
-    def _at_depth(
-        self, progress: Progress, leaves: Sequence[Leaf], places: Sequence[int], request: PlanRequest
-    ) -> list[Leaf]:
+    def _at_depth(self, progress: Progress, leaves: Sequence[Leaf], request: PlanRequest) -> list[Leaf]:
         """Return warps with the parameters of each frame, and with its depth, moved by the warps before, if it counts.
 
         Args:
             progress: before the warps.
-            leaves, places: the warps that will be sampled together, and their places among all effects.
+            leaves: the warps that will be sampled together.
             request: for the composed flow.
         """
-        frame = request.height, request.width
         placed: list[Leaf] = []
         for leaf in leaves:
-            effect, depth = leaf.effect, progress.depth
             params = params_per_frame(leaf.params, progress.frames)
-            if placed and depth is not None and effect.depth is not None:
-                active = [before.effect.active(before.params, *frame) for before in placed]
-                parts = self._parts(placed, places[: len(placed)], active, request, can_measure=False)
-                depth = progress.moved_depth(placed, active, parts)
-            elif depth is None:
-                depth = progress.depth_for(effect)
-            placed.append(leaf._replace(params=effect.at_depth(params, progress.image, depth)))
+            if leaf.effect.depth is not None:
+                depth = progress.depth_for(leaf.effect)
+                if placed and progress.depth is not None:
+                    active = [before.effect.active(before.params) for before in placed]
+                    depth = progress.moved_depth(
+                        placed, active, self._parts(placed, active, request, can_measure=False)
+                    )
+                params = leaf.effect.at_depth(params, progress.image, depth)
+            placed.append(leaf._replace(params=params))
         return placed
 
     @assume_constant_result
@@ -295,9 +278,7 @@ class Compose(Effect):
         request.remaining_px()  # raises for an unreachable tolerance
         groups, stretch = _groups(effects, requests), 1.0
         for group in groups if len(groups) > 1 else ():
-            share = replace(request, tolerance_px=request.tolerance_px / len(groups) / stretch)
-            if not share.is_reachable:
-                share = replace(request, tolerance_px=None)
+            share = replace(request, tolerance_px=request.tolerance_px / len(groups) / stretch).if_reachable()
             for place in group:
                 requests[place] = share
             stretch *= 1 + _plan_group([effects[place] for place in group], share).max_gradient
@@ -382,8 +363,7 @@ def _groups(effects: Sequence[Effect], requests: Sequence[PlanRequest | None]) -
 def _plan_group(warps: Sequence[WarpEffect], request: PlanRequest, *, can_measure: bool = True) -> CompositionPlan:
     """Plan warps that are sampled together."""
     if len(warps) == 1:
-        alone = replace(request, ulps=warps[0].rounding_ulps)
-        plan = warps[0].plan_under(alone if alone.is_reachable else replace(alone, tolerance_px=None))
+        plan = warps[0].plan_under(replace(request, ulps=warps[0].rounding_ulps).if_reachable())
         return CompositionPlan(max(plan.stride, 1), True, (plan,), plan.error_px, plan.max_gradient)
     planned = [
         PlannedWarp(

@@ -19,7 +19,7 @@ from torchrefract._validation import (
     finite_or,
     requires_grad,
 )
-from torchrefract.effects.batch import check_shapes, params_to, per_sample
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import check_frame
 from torchrefract.fields.flare import add_light, flare_axes, screen_light
@@ -174,7 +174,7 @@ class LensFlare(PhotometricEffect):
             for value in (params.radius, params.strength, params.color)
         )
         along_x, along_y = flare_axes(center, radius * math.hypot(width, height), height=height, width=width)
-        along_y, color = along_y * per_sample(strength), color[:, :, None, None]
+        along_y, color = along_y * strength.view(-1, 1, 1, 1), color[:, :, None, None]
 
         def is_valid() -> Tensor:
             if self.blend == "screen":

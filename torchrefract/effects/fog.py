@@ -26,7 +26,6 @@ from torchrefract.effects.batch import (
     check_shapes,
     from_batch,
     params_to,
-    per_sample,
     to_batch,
 )
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -283,7 +282,7 @@ class UniformFog(PhotometricEffect):
     def render(self, image: Tensor, params: FogParams, depth: Tensor | None) -> Rendered:
         """Blend images with fog."""
         is_visible = not self.plan_for(image, params, depth).is_identity
-        k = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
+        k = self.medium.mean_extinction(params, field_dtype(image.dtype)).view(-1, 1, 1, 1)
         return self.medium.blend(image, params, self.medium.distance(image, depth), k, is_visible=is_visible)
 
 

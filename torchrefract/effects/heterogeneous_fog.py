@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch, in_ranges
 from torchrefract._validation import (
+    bounded,
     check_choice,
     check_number,
     check_positive,
@@ -21,7 +22,7 @@ from torchrefract._validation import (
     finite_or,
 )
 from torchrefract.cameras.camera import Camera, pinhole_of
-from torchrefract.effects.batch import check_shapes, frame_mean, params_to, per_sample
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.fog import Airlight, check_fog_params, check_fog_ranges, draw_fog, make_medium
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.random_field import (
@@ -347,7 +348,7 @@ class HeterogeneousFog(PhotometricEffect):
         """Blend images with fog."""
         plan = self.plan_for(image, params, depth)
         distance = self.medium.distance(image, depth)
-        k = mean = per_sample(self.medium.mean_extinction(params, field_dtype(image.dtype)))
+        k = mean = self.medium.mean_extinction(params, field_dtype(image.dtype)).view(-1, 1, 1, 1)
         if plan.octaves is None or len(plan.octaves) > 0:
             rows = image.shape[0]
             distance = expand_batch(distance, rows) if distance.shape[0] > 1 else distance
@@ -396,7 +397,7 @@ class HeterogeneousFog(PhotometricEffect):
             view = {"focal": focal, "center": center, "scales": self.scales, "reach": self.reach}
             q = mean_extinction_along_rays(field, distance, **size, **view)
         of_all_fogs = 0.5 if self.mode == "image" else 1.0
-        return q * (k / (frame_mean(q) if self.mean == "image" else of_all_fogs))
+        return q * (k / (q.mean(dim=(2, 3), keepdim=True) if self.mean == "image" else of_all_fogs))
 
     def _plume(self, scale_height: Tensor, distance: Tensor, image: Tensor) -> Tensor:
         """Compute (N, 1, H, 1 or W): the mean density along each ray."""
@@ -404,15 +405,14 @@ class HeterogeneousFog(PhotometricEffect):
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)
         options = {"dtype": distance.dtype, "device": image.device}
         descent = descent_of_rows(self.horizon, height=height, focal=focal, center=center, **options)
-        length = self._ray_length(distance, image)
-        scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2)
-        scale = per_sample(expand_batch(scale, image.shape[0]))
-        return mean_density(distance, descent / length, scale, camera_height=self.camera_height)
+        descent = descent / self._ray_length(distance, image)
+        scale = finite_or(scale_height.to(distance.dtype), _EVEN).clamp(min=_SCALE_HEIGHTS[0] / 2).view(-1, 1, 1, 1)
+        return mean_density(distance, descent, expand_batch(scale, len(image)), camera_height=self.camera_height)
 
     def _wakes(self, vehicles: Tensor, distance: Tensor, image: Tensor) -> Tensor:
         """Compute (N, 1, H, W): the mean density of the dust behind vehicles along each ray."""
         (rows, _, height, width), dtype = image.shape, distance.dtype
-        boxes = finite_or(vehicles.to(dtype), 0.0).clamp(-_FARTHEST_PX, _FARTHEST_PX)
+        boxes = bounded(vehicles.to(dtype), -_FARTHEST_PX, _FARTHEST_PX)
         boxes = boxes.flatten(0, 1) if boxes.ndim == 4 else expand_batch(boxes, rows)
         depth = expand_batch(distance / self._ray_length(distance, image), rows)
         (_, focal), (_, center) = pinhole_of(self.medium.camera, height=height, width=width)

@@ -28,7 +28,7 @@ from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.filled_frame import points_without_zoom, zoom_to_fill, zoomed_flow
 from torchrefract.fields.lens import lens_flow, lens_restore_flow, misses_in_frame, newton_lens_flow
 from torchrefract.fields.lens_error import LensErrorModel, LensRanges
-from torchrefract.fields.lens_source import LensSource, camera_with_covariance, jittered_camera, lenses_from_cameras
+from torchrefract.fields.lens_source import LensSource, camera_with_covariance, lenses_from_cameras, ranges_around
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
 from torchrefract.warping.grid import Points
@@ -58,10 +58,8 @@ class LensParams(NamedTuple):
     @property
     def is_identity(self) -> Tensor:
         """Return (B,), bool: all coefficients are zero, and the clean view is that of the lens."""
-        is_pinhole = (self.coefficients == 0).all(dim=1)
-        if self.zoom is None or self.shift is None:
-            return is_pinhole
-        return is_pinhole & (self.zoom == 1) & (self.shift == 0).all(dim=1)
+        zoom, shift = clean_view(self)
+        return (self.coefficients == 0).all(dim=1) & (zoom == 1) & (shift == 0).all(dim=1)
 
 
 class LensDistortion(WarpEffect):
@@ -175,7 +173,7 @@ class LensDistortion(WarpEffect):
         """
         warp = {"padding": padding, "interpolation": interpolation, "backend": backend, "p": p, "frame": frame}
         if covariance is None:
-            ranges = jittered_camera(camera, jitter=jitter, residual_px=residual_px).ranges
+            ranges = ranges_around(camera, jitter=jitter, residual_px=residual_px)
             return cls(**ranges, strict=strict, tolerance_px=tolerance_px, **warp)
         if jitter:
             raise ValueError(f"jitter must be 0 if a covariance is given, got {jitter}")
@@ -262,18 +260,15 @@ class LensDistortion(WarpEffect):
             steps = plan.details.steps_for(points.lattice.stride)
             terms = ALL_TERMS if requires_grad(lens[:1]) else plan.details.terms
             flow, exists = newton_lens_flow(*lens, points, num_steps=steps, terms=terms), everywhere(points.x.device)
-        if params.zoom is not None and params.shift is not None:
-            flow = zoomed_flow(flow, points, lens[2], params.zoom, params.shift * width)
-        return flow, exists
+        zoom, shift = clean_view(params)
+        return zoomed_flow(flow, points, lens[2], zoom, shift * width), exists
 
     def inverse_flow(self, params: LensParams, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Distort the pixels, in closed form."""
         height, width = flow.shape[2:]
         points = pixel_lattice(height, width).points(dtype=params.focal.dtype, device=params.focal.device)
-        lens = lens_in_px(params, height, width)
-        if params.zoom is None or params.shift is None:
-            return lens_restore_flow(*lens, points)
-        wide = points_without_zoom(points, lens[2], params.zoom, params.shift * width)
+        lens, (zoom, shift) = lens_in_px(params, height, width), clean_view(params)
+        wide = points_without_zoom(points, lens[2], zoom, shift * width)
         inverse, exists = lens_restore_flow(*lens, wide)
         return inverse + torch.cat([wide.x - points.x, wide.y - points.y], dim=1), exists
 
@@ -308,9 +303,8 @@ class LensDistortion(WarpEffect):
 
     def clean_cameras(self, params: LensParams, *, height: int, width: int) -> list[Camera]:
         """Return the pinhole of each clean frame: that of the lens, with its zoom and its shift."""
-        _, focal, center = lens_in_px(params, height, width)
-        if params.zoom is not None and params.shift is not None:
-            focal, center = focal * params.zoom[:, None], center + width * params.shift
+        (_, focal, center), (zoom, shift) = lens_in_px(params, height, width), clean_view(params)
+        focal, center = focal * zoom[:, None], center + width * shift
         size: Any = {
             "width": width,
             "height": height,
@@ -363,6 +357,13 @@ class LensDistortion(WarpEffect):
             k1, k2 = params.coefficients[sample, :2].tolist()
             raise ValueError(f"coefficients: {rule}, got k1 = {k1:g} and k2 = {k2:g} in sample {sample}")
         warn(f"{rule}: pixels beyond have no preimage and are padded, not valid")
+
+
+def clean_view(params: LensParams) -> tuple[Tensor, Tensor]:
+    """Return the zoom, (B,), and the shift, (B, 2), in widths, of the clean frames; 1 and 0 if params have none."""
+    if params.zoom is None or params.shift is None:
+        return torch.ones_like(params.focal[:, 0]), torch.zeros_like(params.center)
+    return params.zoom, params.shift
 
 
 def check_lens(

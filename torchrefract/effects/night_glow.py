@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_number, check_within, finite_or
+from torchrefract._validation import bounded, check_number, check_within
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.exposure import is_unsaturated
@@ -112,12 +112,11 @@ class NightGlow(PhotometricEffect):
         focal = pinhole_of(self.camera, height=height, width=width).focal[0]
         stride = lattice_stride(image)
 
-        def parameter(name: str) -> Tensor:
-            # Invalid values cannot be read on an accelerator; a clamp would have no gradient at the ends of the range.
-            value, (low, high) = getattr(params, name).to(field_dtype(image.dtype)), _LIMITS[name]
-            return expand_batch(finite_or(value, low).clamp(low - 0.05 * high, 1.05 * high), len(image))
-
-        thickness, asymmetry, luminance = map(parameter, _LIMITS)
+        dtype = field_dtype(image.dtype)
+        thickness, asymmetry, luminance = (
+            expand_batch(bounded(getattr(params, name).to(dtype), *limits), len(image))
+            for name, limits in _LIMITS.items()
+        )
         light = lamp_light(image, self.threshold)
         nodes = glow_at_nodes(light, thickness, asymmetry, focal=focal, stride=stride)
         strength = -torch.expm1(-thickness) * luminance

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch
 from torchrefract._validation import eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample, rows_of_samples, select_params, where_active
+from torchrefract.effects.batch import rows_of_samples, select_params, where_active
 from torchrefract.planning.photometric import PhotometricPlan, PhotometricRequest, exact_plan
 from torchrefract.planning.plan import check_tolerance
 from torchrefract.types import Degraded, Map
@@ -98,9 +98,9 @@ class PhotometricEffect(Effect):
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Degrade images (N, C, H, W), floating, with valid parameters of B samples."""
-        active = params.applied & ~params.is_identity
         if not self.may_change(params):
             return self._unchanged(image, params)
+        active = self.active(params)
         index = _active_samples(active, params)
         if index is not None:
             return self._degrade_samples(image, params, depth, index)
@@ -114,7 +114,7 @@ class PhotometricEffect(Effect):
             if eager_values(active.all, of=active) is not True:
                 rows = max(value.shape[0], len(active))
                 unchanged = _UNCHANGED[name]
-                value = torch.where(per_sample(expand_batch(active, rows)), expand_batch(value, rows), unchanged)
+                value = torch.where(expand_batch(active, rows).view(-1, 1, 1, 1), expand_batch(value, rows), unchanged)
             return value.expand(-1, 1, *image.shape[2:])
 
         is_same = rendered.image is image
@@ -123,12 +123,7 @@ class PhotometricEffect(Effect):
 
     def _with_maps(self, image: Tensor, params: Any, map_of: Callable[[str], Tensor]) -> Degraded:
         """Build a result whose maps are computed from their names when they are first read."""
-
-        def lazy_map(name: str) -> Map:
-            return lambda: map_of(name)
-
-        light = {name: lazy_map(name) for name in self.maps}
-        return Degraded(image, params, valid=lazy_map("valid"), light=light)
+        return Degraded(image, params, {name: lambda _, name=name: map_of(name) for name in ("valid", *self.maps)})
 
     def _unchanged(self, image: Tensor, params: Any) -> Degraded:
         def constant(name: str) -> Tensor:

@@ -10,19 +10,17 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import expand_batch, in_ranges
 from torchrefract._validation import (
+    bounded,
     check_count,
     check_number,
     check_positive,
     check_range,
     check_within,
-    eager_values,
-    finite_or,
-    requires_grad,
 )
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.batch_flow import everywhere
-from torchrefract.effects.random_field import check_frame, frames_of
+from torchrefract.effects.random_field import check_frame, frames_of, is_still
 from torchrefract.effects.warp_effect import WarpEffect
 from torchrefract.fields.depth import DepthSource, GroundPlaneDepth, check_depth_provider
 from torchrefract.fields.physical_turbulence import (
@@ -192,7 +190,7 @@ class PhysicalTurbulence(WarpEffect):
         u = v = torch.zeros((), dtype=dtype, device=depth.device)
         for share, (along_x, along_y) in zip(shares, gradients, strict=True):
             u, v = torch.addcmul(u, share, along_x), torch.addcmul(v, share, along_y)
-        scale = finite_or(air.tilt, 0.0).clamp(-_LARGEST_TILT, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
+        scale = bounded(air.tilt, 0.0, _LARGEST_TILT).view(-1, 1, 1, 1) * 1e-6
         if self.height is not None:
             below = (points.y - (self.horizon * height - 0.5)) / focal[1]
             scale = scale * height_gain(1 - depth * below / self.height, self._layers.gains)
@@ -235,11 +233,10 @@ class PhysicalTurbulence(WarpEffect):
 
     def _shift(self, params: PhysicalTurbulenceParams) -> Tensor | None:
         """Return (N, 2), m: how far the wind has moved the air, or None if it has not."""
-        may_move = params.frame.shape[1] > 1 or requires_grad((params.frame, params.wind))
-        if not may_move and eager_values((params.frame == 0).all, of=params.frame):
+        if is_still(params.frame, params.wind):
             return None
         frame = frames_of(params).double()[:, None]
-        wind = expand_batch(finite_or(params.wind, 0.0).clamp(-_FASTEST, _FASTEST), len(frame))
+        wind = expand_batch(bounded(params.wind, -_FASTEST, _FASTEST), len(frame))
         return frame / self.fps * wind.double()
 
 

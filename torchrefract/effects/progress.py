@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import eager_values
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import per_sample
 from torchrefract.effects.batch_flow import BatchFlow, FlowPart, SamplingOptions
 from torchrefract.effects.photometric_effect import PhotometricEffect
 from torchrefract.effects.warp_effect import WarpEffect, mean_of_exposures, warped
@@ -36,6 +35,7 @@ class Leaf(NamedTuple):
     effect: Any  # a `WarpEffect` or a `PhotometricEffect`
     params: Any
     options: SamplingOptions  # first those of the compositions around it
+    place: int  # among all effects that are not compositions, in order
 
 
 class _Segment(NamedTuple):
@@ -164,7 +164,8 @@ class Progress:
         everywhere = lambda: torch.ones(size[0], 1, *size[2:], dtype=torch.bool, device=device)  # noqa: E731 - used once
         valid = everywhere if self.valid is None else self.valid
         if not self.has_warps:
-            return Degraded(self.image, params, valid=valid, light=self.light)
+            maps = {"valid": valid, **self.light}
+            return Degraded(self.image, params, {name: lambda _, value=value: value() for name, value in maps.items()})
         return warped(
             self.image,
             params,
@@ -186,7 +187,7 @@ class Progress:
             return torch.zeros(rows, 2, height, width, dtype=field_dtype(self.image.dtype), device=self.image.device)
         flow = self.segments[-1].flow.dense
         for segment in reversed(self.segments[:-1]):
-            flow = torch.where(per_sample(segment.active), compose_flows(segment.flow.dense, flow), flow)
+            flow = torch.where(segment.active.view(-1, 1, 1, 1), compose_flows(segment.flow.dense, flow), flow)
         return flow
 
     def _is_composed(self) -> Tensor:
@@ -203,7 +204,7 @@ class Progress:
             if total is None:
                 total, valid, moved = inverse, exists, moves
                 continue
-            both, alone = per_sample(moved & moves), per_sample(moves)
+            both, alone = (moved & moves).view(-1, 1, 1, 1), moves.view(-1, 1, 1, 1)
             if eager_values(both.any, of=both) is not False:
                 exists = torch.where(both, valid & sees_only_valid(exists, total), exists)
                 inverse = torch.where(both, compose_flows(inverse, total), inverse)
@@ -233,7 +234,7 @@ def _valid_after(
     """Return where an image is valid after one more warp."""
 
     def valid() -> Tensor:
-        sampled_inside = (flow().exists & inside(flow().dense)) | ~per_sample(moves)
+        sampled_inside = flow().leads_inside(moves)
         return sampled_inside if before is None else sampled_inside & sees_only_valid(before(), flow().dense)
 
     return valid
@@ -258,6 +259,6 @@ def _sample_segment(image: Tensor, segment: _Segment, leaves: Sequence[Leaf], ac
     for leaf, moves in zip(reversed(leaves[:-1]), reversed(active[:-1]), strict=True):
         chosen = moves & ~decided
         if leaf.options != leaves[-1].options and eager_values(chosen.any, of=chosen) is not False:
-            result = torch.where(per_sample(chosen), segment.sample(image, leaf.options), result)
+            result = torch.where(chosen.view(-1, 1, 1, 1), segment.sample(image, leaf.options), result)
         decided = decided | moves
     return result

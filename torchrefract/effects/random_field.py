@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchrefract._tensor import expand_batch
 from torchrefract._validation import (
+    bounded,
     check_range,
     check_values,
     check_within,
     eager_values,
-    finite_or,
     requires_grad,
     warn,
 )
@@ -66,7 +66,7 @@ def check_frame(params: Any) -> None:
 
 def frames_of(params: Any) -> Tensor:
     """Return (B T,), the numbers of the frames, within the bounds of `check_frame`; a NaN counts as frame 0."""
-    return finite_or(params.frame.reshape(-1), 0.0).clamp(-LATEST_FRAME, LATEST_FRAME)
+    return bounded(params.frame.reshape(-1), -LATEST_FRAME, LATEST_FRAME)
 
 
 def check_field_range(name: str, value: Range) -> Range:
@@ -90,7 +90,7 @@ def motion_of(params: Any) -> Motion:
     wind, decorrelation = (expand_batch(value, rows) for value in (params.wind, params.decorrelation))
     return Motion(
         frames_of(params),
-        finite_or(wind, 0.0).clamp(-_FASTEST, _FASTEST),
+        bounded(wind, -_FASTEST, _FASTEST),
         torch.where(decorrelation > 0, decorrelation.clamp(min=_SHORTEST), torch.inf),
     )
 
@@ -99,16 +99,15 @@ def field_params(params: Any) -> FieldParams:
     """Return sizes, noise and motion of each frame, N = B T rows."""
     rows = params.frame.numel()
     aperture = expand_batch(params.aperture, rows) if "aperture" in params._fields else None
-    motion = None if _is_still(params) else motion_of(params)
+    motion = None if is_still(params.frame, params.wind, params.decorrelation) else motion_of(params)
     return FieldParams(expand_batch(params.length, rows), aperture, expand_batch(params.key, rows), motion)
 
 
-def _is_still(params: Any) -> bool:
+def is_still(frame: Tensor, *motion: Tensor) -> bool:
     """Return True if all samples are at frame 0 and no gradient of time is needed, as far as values can be read."""
-    moving = (params.frame, params.wind, params.decorrelation)
-    if params.frame.shape[1] > 1 or requires_grad(moving):
+    if frame.shape[1] > 1 or requires_grad((frame, *motion)):
         return False
-    return eager_values((params.frame == 0).all, of=params.frame) is True
+    return eager_values((frame == 0).all, of=frame) is True
 
 
 def warn_if_clipped(clipped: Tensor, params: Any, size: tuple[int, int]) -> None:

@@ -44,8 +44,7 @@ class RectificationParams(NamedTuple):
         """Return (B,), bool: all coefficients are zero; never so for a fisheye, which has 4 of them."""
         # The radius of a fisheye is an angle, so that it distorts without any coefficient too.
         is_fisheye = self.coefficients.shape[1] == 4
-        is_pinhole = (self.coefficients == 0).all(dim=1) & (not is_fisheye)
-        return is_pinhole if self.zoom is None else is_pinhole & (self.zoom == 1)
+        return (self.coefficients == 0).all(dim=1) & (not is_fisheye) & (_zoom_of(self) == 1)
 
 
 class Rectification(WarpEffect):
@@ -129,13 +128,12 @@ class Rectification(WarpEffect):
         height, width = points.lattice.height, points.lattice.width
         self.camera.resized(width=width, height=height)  # raises for another ratio of the sides
         camera = lens_in_px(params, height, width)
-        rays = points if params.zoom is None else points_without_zoom(points, camera[2], params.zoom)
+        rays = points_without_zoom(points, camera[2], _zoom_of(params))
         if self.model == "polynomial12":
             flow, exists = lens_restore_flow(*camera, rays)
         else:
             flow, exists = rectification_flow(*camera, rays, model=self.model)
-        if params.zoom is not None:
-            flow = flow + torch.cat([rays.x - points.x, rays.y - points.y], dim=1)
+        flow = flow + torch.cat([rays.x - points.x, rays.y - points.y], dim=1)
 
         def folds() -> Tensor:
             is_missing = is_border_missing(*camera, model=self.model, height=height, width=width)
@@ -155,9 +153,7 @@ class Rectification(WarpEffect):
             inverse, exists = lens_flow(*camera, points)
         else:
             inverse, exists = rectification_restore_flow(*camera, points, model=self.model)
-        if params.zoom is not None:
-            inverse = zoomed_flow(inverse, points, camera[2], params.zoom)
-        return inverse, exists
+        return zoomed_flow(inverse, points, camera[2], _zoom_of(params)), exists
 
     def error_model(self) -> RectificationErrorModel:
         """Return the error bounds of the camera."""
@@ -194,3 +190,8 @@ class Rectification(WarpEffect):
             (camera.fx / width, camera.fy / width),
             ((camera.cx - middle[0]) / width, (camera.cy - middle[1]) / width),
         )
+
+
+def _zoom_of(params: RectificationParams) -> Tensor:
+    """Return the zoom, (B,), of the rectified frames; 1 if the params have none."""
+    return torch.ones_like(params.focal[:, 0]) if params.zoom is None else params.zoom

@@ -11,12 +11,12 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import in_ranges
 from torchrefract._validation import (
+    bounded,
     check_count,
     check_number,
     check_positive,
     check_within,
     eager_values,
-    finite_or,
     requires_grad,
 )
 from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
@@ -160,7 +160,7 @@ class RoadMirage(WarpEffect):
     def flow(self, params: ParamsAtDepth, points: Points, plan: WarpPlan) -> tuple[Tensor, Tensor]:
         """Compute the flow at points; it exists everywhere."""
         mirage: RoadMirageParams = params.params
-        values = {name: finite_or(getattr(mirage, name), 0.0).clamp(*ends) for name, ends in _BOUNDS.items()}
+        values = {name: bounded(getattr(mirage, name), *ends) for name, ends in _BOUNDS.items()}
         below = points.y - (self.horizon * plan.height - 0.5)
         focal = self.focal * plan.width
         inverse_depth = sample_at(1 / params.depth.detach().to(below.dtype).clamp(min=1e-6), points)

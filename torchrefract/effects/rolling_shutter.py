@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number, check_values, check_within, finite_or
+from torchrefract._validation import bounded, check_count, check_number, check_values, check_within, finite_or
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import ParamsAtDepth, check_shapes, params_to
 from torchrefract.effects.random_field import check_frame, frames_of
@@ -21,8 +21,8 @@ from torchrefract.fields.rolling_shutter import (
 from torchrefract.fields.rolling_shutter_error import RollingShutterErrorModel
 from torchrefract.planning.plan import TOLERANCE_PX, WarpPlan
 from torchrefract.types import Range
-from torchrefract.warping.grid import Points
-from torchrefract.warping.invert import residual_of
+from torchrefract.warping.flow import compose_flows
+from torchrefract.warping.grid import Points, length
 from torchrefract.warping.lattice import pixel_lattice
 
 _BOUNDS: dict[str, Range] = {
@@ -173,7 +173,7 @@ class RollingShutter(WarpEffect):
         points = pixel_lattice(height, width).points(dtype=flow.dtype, device=flow.device)
         view = pinhole_of(self.camera, height=height, width=width)
         inverse, exists = rolling_shutter_restore_flow(motion, inverse_depth, points, view)
-        return inverse, exists & (residual_of(flow, inverse) <= _RESIDUAL_PX)
+        return inverse, exists & (length(compose_flows(flow, inverse)) <= _RESIDUAL_PX)
 
     def error_model(self) -> RollingShutterErrorModel:
         """Return the error bounds of the ranges for the depth of the provider."""
@@ -205,25 +205,17 @@ class RollingShutter(WarpEffect):
         """Return the motion of each frame in SI units, and 1 / depth; values that are not finite move nothing."""
         params: Any
         params, depth, moment = at_depth
-
-        def bounded(name: str, value: Tensor) -> Tensor:
-            # On an accelerator invalid values cannot be read; a clamp would have no gradient at the ends of the range.
-            largest = 2 * _BOUNDS[name][1]
-            return finite_or(value, 0.0).clamp(-largest, largest)
-
-        frequency = bounded("frequency", params.frequency)
+        frequency = bounded(params.frequency, *_BOUNDS["frequency"])
         # Late frames have large phases, of which float32 would lose the digits.
         turns = frequency.double() * (frames_of(params).double()[:, None] / self.fps)
-        phase = (
-            finite_or(params.phase, 0.0) + 2 * math.pi * (turns - turns.detach().floor()).to(frequency.dtype)[:, None]
-        )
-        exposure = bounded("exposure", params.exposure) / 1000
+        turns = (turns - turns.detach().floor()).to(frequency.dtype)[:, None]
+        exposure = bounded(params.exposure, *_BOUNDS["exposure"]) / 1000
         motion = ShutterMotion(
-            speed=bounded("speed", params.speed) / 3.6,
-            readout=bounded("readout", params.readout) / 1000,
+            speed=bounded(params.speed, *_BOUNDS["speed"]) / 3.6,
+            readout=bounded(params.readout, *_BOUNDS["readout"]) / 1000,
             moment=torch.zeros_like(exposure) if moment is None else moment.to(exposure.dtype) * exposure,
-            amplitude=torch.deg2rad(bounded("pitch", params.amplitude)),
+            amplitude=torch.deg2rad(bounded(params.amplitude, *_BOUNDS["pitch"])),
             frequency=frequency,
-            phase=phase,
+            phase=finite_or(params.phase, 0.0) + 2 * math.pi * turns,
         )
         return motion, 1 / depth.to(frequency.dtype).clamp(min=_NEAREST)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, expand_batch
 from torchrefract._validation import (
+    bounded,
     check_color,
     check_count,
     check_number,
@@ -272,8 +273,7 @@ class SunGlare(PhotometricEffect):
         is_inside = ((place >= 0) & (place <= 1)).all(dim=1).to(dtype)
 
         def expanded(value: Tensor, low: float, high: float) -> Tensor:
-            # At the very end of its range, a clamp would have no gradient.
-            return expand_batch(finite_or(value.to(dtype), low).clamp(0.999 * low - 1e-6, 1.001 * high), rows)
+            return expand_batch(bounded(value.to(dtype), low, high), rows)
 
         ghosts = [expanded(params.ghosts[..., i], *span) for i, span in enumerate(_GHOST_LIMITS.values())]
         return Sun(

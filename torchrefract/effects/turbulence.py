@@ -33,13 +33,12 @@ from torchrefract.planning.plan import (
     ErrorModel,
     PlanRequest,
     WarpPlan,
-    lattice_with_stride,
     plan_warp,
 )
 from torchrefract.types import FlowBounds, Range, Simplification
 from torchrefract.warping.grid import Points
 from torchrefract.warping.implicit import sample_at
-from torchrefract.warping.lattice import LatticeFlow, lattice_around, pixel_lattice
+from torchrefract.warping.lattice import LatticeFlow, lattice_around, lattice_with_stride, pixel_lattice
 
 # A field folds the image first where a gradient of five standard deviations reaches 1.
 _FOLDING_GRADIENT = 0.2

@@ -10,7 +10,7 @@ from torchrefract import random
 from torchrefract._tensor import assume_constant_result, expand_batch, in_ranges
 from torchrefract._validation import check_number, check_range, check_within, eager_values, finite_or, requires_grad
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera, check_camera, pinhole_of
-from torchrefract.effects.batch import check_shapes, params_to, per_sample
+from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.compose import Compose, ComposeParams
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
 from torchrefract.effects.physical_turbulence import PhysicalTurbulence, road_depth
@@ -178,7 +178,7 @@ class TurbulenceBlur(PhotometricEffect):
             return Rendered(image, is_valid)
         view, largest = self._view(height, width), self._largest_strength
         light = srgb_to_linear(finite_image(image.contiguous()).clamp(0, 1))
-        ratio = per_sample(finite_or(params.ratio.to(light.dtype), 0.0).clamp(0.0, 1.05 * _LARGEST_RATIO))
+        ratio = finite_or(params.ratio.to(light.dtype), 0.0).clamp(0.0, 1.05 * _LARGEST_RATIO).view(-1, 1, 1, 1)
         ratio, share = (
             expand_batch(value, len(image)) for value in (ratio, self._share_of_reach(image, depth, view.focal[1]))
         )

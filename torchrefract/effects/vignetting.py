@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchrefract import random
 from torchrefract._tensor import expand_batch
-from torchrefract._validation import check_flag, check_range, check_within, finite_or
+from torchrefract._validation import bounded, check_flag, check_range, check_within
 from torchrefract.cameras.camera import Camera, check_camera, pinhole_of
 from torchrefract.effects.batch import check_shapes, params_to
 from torchrefract.effects.photometric_effect import PhotometricEffect, Rendered
@@ -82,8 +82,7 @@ class Vignetting(PhotometricEffect):
     def render(self, image: Tensor, params: VignettingParams, depth: Tensor | None) -> Rendered:
         """Darken images."""
         height, width = image.shape[2:]
-        # Invalid values cannot be read on an accelerator; a clamp would have no gradient at the ends of the range.
-        strength = finite_or(params.strength.to(field_dtype(image.dtype)), 0.0).clamp(-1, 2)
+        strength = bounded(params.strength.to(field_dtype(image.dtype)), 0.0, 1.0)
         view = pinhole_of(self.camera, height=height, width=width)
         t = vignetting(expand_batch(strength, len(image)), view, height=height, width=width)
         # Powers are rounded by the place of a value in memory, so that all layouts are computed in one.

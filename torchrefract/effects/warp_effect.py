@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrefract._tensor import assume_constant_result, expand_batch, to_float
 from torchrefract._validation import check_choice, eager_values, requires_grad
 from torchrefract.effects.base import Effect
-from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, per_sample, where_active
+from torchrefract.effects.batch import ParamsAtDepth, params_per_frame, where_active
 from torchrefract.effects.batch_flow import (
     COARSEST,
     BatchFlow,
@@ -20,9 +20,10 @@ from torchrefract.effects.batch_flow import (
     SamplingOptions,
     WarpFlow,
     can_read,
-    flow_at_nodes,
+    everywhere,
     flow_dtype,
     flow_on_measured_lattice,
+    masked_flow,
     zero_flow,
 )
 from torchrefract.fields.depth import frame_depth
@@ -33,13 +34,13 @@ from torchrefract.planning.plan import (
     PlanRequest,
     WarpPlan,
     check_tolerance,
-    lattice_with_stride,
     plan_warp,
 )
-from torchrefract.types import Degraded, Inverse, Map
+from torchrefract.types import Degraded, Inverse
 from torchrefract.warping.flow import compose_flows, folding, is_shown_once
-from torchrefract.warping.grid import Points, field_dtype, inside, length
+from torchrefract.warping.grid import Points, field_dtype, length
 from torchrefract.warping.invert import invert_flow
+from torchrefract.warping.lattice import LatticeFlow, lattice_with_stride
 from torchrefract.warping.warp import BACKENDS, INTERPOLATIONS, PADDINGS, sees_only_valid
 
 # Of a composed inverse; smooth ones are off by far less, those between two sheets of a fold by more.
@@ -68,6 +69,7 @@ class WarpEffect(Effect):
         p: probability that a sample is degraded.
     """
 
+    keeps_uint8 = True  # sampling rounds its result
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
     has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
@@ -122,15 +124,10 @@ class WarpEffect(Effect):
         """
         return [0.0]
 
-    @property
-    def keeps_uint8(self) -> bool:
-        """Return True: sampling rounds its result."""
-        return True
-
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
         """Return the plan for all parameters in the ranges."""
-        request = self.plan_request(height, width, dtype).with_reachable_default()
-        return self.plan_under(request)
+        request = PlanRequest(height, width, self.tolerance_px, dtype is torch.float64, self.rounding_ulps)
+        return self.plan_under(request.with_reachable_default())
 
     def plan_under(self, request: PlanRequest) -> WarpPlan:
         """Return the plan for a request; an effect without a tolerance stays exact.
@@ -144,10 +141,6 @@ class WarpEffect(Effect):
         if self.has_closed_form and not self.has_kinks and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)
         return plan
-
-    def plan_request(self, height: int, width: int, dtype: torch.dtype) -> PlanRequest:
-        """Return the request of a plan under the tolerance of this effect."""
-        return PlanRequest(height, width, self.tolerance_px, dtype is torch.float64, self.rounding_ulps)
 
     def for_params(self, params: Any, height: int, width: int) -> "WarpEffect":
         """Return this effect, or an exact one if parameters lie outside the ranges that its plan holds for."""
@@ -176,21 +169,14 @@ class WarpEffect(Effect):
         params = params_per_frame(params, rows // max(len(params.applied), 1))
         return ParamsAtDepth(params, expand_batch(frame_depth(self.depth, image, depth), rows))
 
-    def active(self, params: Any, height: int, width: int) -> Tensor:
-        """Return (B,), bool: the samples that move."""
-        return params.applied & ~params.is_identity & (height * width > 1)
-
     def warp_flow(self, params: Any, plan: WarpPlan) -> WarpFlow:
         """Return the flow as a function of points."""
-        active = self.active(params, plan.height, plan.width)
-        return WarpFlow(self.flow, params, active, plan, has_closed_form=self.has_closed_form)
+        return WarpFlow(self.flow, params, self.active(params), plan, has_closed_form=self.has_closed_form)
 
     def masked_inverse_flow(self, params: Any, flow: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the flow that undoes a masked one (N, 2, H, W), zero for samples that do not move."""
-        active = expand_batch(self.active(params, *flow.shape[2:]), flow.shape[0])
         inverse, exists = self.inverse_flow(params, flow)
-        inverse = expand_batch(inverse, flow.shape[0])
-        return where_active(inverse, 0.0, active, params), exists | ~per_sample(active)
+        return masked_flow(expand_batch(inverse, len(flow)), exists, self.active(params), params)
 
     def must_be_exact(self, params: Any) -> bool:
         """Return True at a map of depth for which no plan of the ranges holds."""
@@ -216,7 +202,10 @@ class WarpEffect(Effect):
         if plan.is_measured and can_read(params):
             exact = self.warp_flow(params, plan).exact()
             return flow_on_measured_lattice([exact], stride=COARSEST, tolerance_px=plan.error_px)
-        return [flow_at_nodes(self.warp_flow(params, plan), lattice_with_stride(plan.height, plan.width, plan.stride))]
+        lattice = lattice_with_stride(plan.height, plan.width, plan.stride)
+        points = lattice.points(dtype=flow_dtype(params), device=params.applied.device)
+        flow, exists = masked_flow(*self.flow(params, points, plan), self.active(params), params)
+        return [FlowPart(None, LatticeFlow(flow, lattice), exists if lattice.stride == 1 else everywhere(flow.device))]
 
     def degrade_batch(self, image: Tensor, params: Any, depth: Tensor | None) -> Degraded:
         """Sample the images along the flow."""
@@ -225,9 +214,9 @@ class WarpEffect(Effect):
             return unchanged(image, params)
         drawn, params = params, self.at_depth(params, image, depth)
         flow, moments = self.flow_by_plan(params, height, width), self.moments()
-        if flow.is_zero and len(moments) == 1:
+        if flow.parts[0].is_zero and len(moments) == 1:
             return unchanged(image, drawn)
-        active = self.active(params, height, width)  # a flow has B rows, or as many as there are images
+        active = self.active(params)  # a flow has B rows, or as many as there are images
         moves = expand_batch(active, len(image))
         options = SamplingOptions(self.padding, self.interpolation, self.backend)
 
@@ -239,7 +228,7 @@ class WarpEffect(Effect):
             mean_of_exposures(image, len(moments), sampled, moves, params),
             drawn,
             flow=lambda: flow.dense,
-            valid=lambda: (flow.exists & inside(flow.dense)) | ~per_sample(expand_batch(active, flow.dense.shape[0])),
+            valid=lambda: flow.leads_inside(active),
             inverse=lambda: self.masked_inverse_flow(params, flow.dense),
         )
 
@@ -251,8 +240,8 @@ class WarpEffect(Effect):
 
     @assume_constant_result
     def _constant_share(self, _: int, height: int, width: int, dtype: torch.dtype, share_px: float | None) -> WarpPlan:
-        request = replace(self.plan_request(height, width, dtype), tolerance_px=share_px)
-        return self.plan_under(request if request.is_reachable else replace(request, tolerance_px=None))
+        request = PlanRequest(height, width, share_px, dtype is torch.float64, self.rounding_ulps)
+        return self.plan_under(request.if_reachable())
 
 
 def mean_of_exposures(
@@ -283,7 +272,7 @@ def warped(
     valid: Callable[[], Tensor],
     inverse: Callable[[], tuple[Tensor, Tensor]],
     is_composed: Callable[[], Tensor] | None = None,
-    light: Mapping[str, Map] | None = None,
+    light: Mapping[str, Callable[[], Tensor]] | None = None,
 ) -> Degraded:
     """Build the result of an effect with a flow; its maps are computed when they are first read.
 
@@ -296,25 +285,26 @@ def warped(
         light: photometric maps by name.
     """
 
-    def restore_valid(result: Degraded, exists: Tensor) -> Tensor:
+    def restore_valid(result: Degraded) -> Tensor:
+        exists = result.inverse.valid
         good = exists & sees_only_valid(*_expand_alike(result.valid, result.restore_flow))
         composed = None if is_composed is None else is_composed()
         if composed is None or eager_values(composed.any, of=composed) is False:
             return good
         is_once = is_shown_once(*_expand_alike(result.flow, result.restore_flow, exists, result.valid))
         is_inverse = (result.restore_residual <= _MAX_RESIDUAL_PX) & is_once
-        return good & (~per_sample(composed) | is_inverse)
+        return good & (~composed.view(-1, 1, 1, 1) | is_inverse)
 
+    maps: dict[str, Callable[[Degraded], Any]] = {
+        "valid": lambda _: valid(),
+        "flow": lambda _: flow(),
+        "restore_flow": lambda _: Inverse(*inverse()),
+        "restore_valid": restore_valid,
+        "restore_residual": lambda result: length(compose_flows(result.flow, result.restore_flow)),
+        "folding": lambda result: folding(result.flow, result.valid),
+    }
     return Degraded(
-        image,
-        params,
-        valid=valid,
-        flow=flow,
-        restore=lambda _: Inverse(*inverse()),
-        restore_valid=restore_valid,
-        residual=lambda result: length(compose_flows(result.flow, result.restore_flow)),
-        folding=lambda result: folding(result.flow, result.valid),
-        light=light,
+        image, params, maps | {name: lambda _, value=value: value() for name, value in (light or {}).items()}
     )
 
 
@@ -323,16 +313,15 @@ def unchanged(image: Tensor, params: Any) -> Degraded:
     size = (image.shape[0], 1, *image.shape[2:])
     everywhere = torch.ones(size, dtype=torch.bool, device=image.device)
     zero = torch.zeros(size, dtype=field_dtype(image.dtype), device=image.device).expand(-1, 2, -1, -1)
-    return Degraded(
-        image,
-        params,
-        valid=lambda: everywhere,
-        flow=lambda: zero,
-        restore=lambda _: Inverse(zero, everywhere),
-        restore_valid=lambda _, exists: exists,
-        residual=lambda _: zero[:, :1],
-        folding=lambda _: folding(zero),
-    )
+    maps: dict[str, Callable[[Degraded], Any]] = {
+        "valid": lambda _: everywhere,
+        "flow": lambda _: zero,
+        "restore_flow": lambda _: Inverse(zero, everywhere),
+        "restore_valid": lambda _: everywhere,
+        "restore_residual": lambda _: zero[:, :1],
+        "folding": lambda _: folding(zero),
+    }
+    return Degraded(image, params, maps)
 
 
 def _expand_alike(*values: Tensor) -> list[Tensor]:

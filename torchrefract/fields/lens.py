@@ -23,7 +23,6 @@ from torchrefract.warping.implicit import implicit
 
 # Preimages are searched up to this many half-diagonals of the frame from the center.
 REACH = 4.0
-_BORDER_POINTS = 17  # on each side of the frame, where folds begin
 
 
 def lens_flow(coefficients: Tensor, focal: Tensor, center: Tensor, points: Points) -> tuple[Tensor, Tensor]:
@@ -107,16 +106,6 @@ def misses_in_frame(exists: Tensor, points: Points) -> Tensor:
     last_x, last_y = points.lattice.width - 1, points.lattice.height - 1
     is_inside = (points.x >= 0) & (points.x <= last_x) & (points.y >= 0) & (points.y <= last_y)
     return (is_inside & ~exists).flatten(1).any(dim=1)
-
-
-def border_on_plane(focal: Tensor, center: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Return x and y, (B, 1, 1, N), on the plane z = 1, of points on the border of the frame."""
-    steps = torch.linspace(0, 1, _BORDER_POINTS, dtype=focal.dtype, device=focal.device)
-    ends = as_device_tensor([0, 1], dtype=focal.dtype, device=focal.device)
-    sides = torch.cat([torch.cartesian_prod(steps, ends), torch.cartesian_prod(ends, steps)])
-    size = as_device_tensor([width - 1, height - 1], dtype=focal.dtype, device=focal.device)
-    x, y = ((sides * size - center[:, None]) / focal[:, None])[:, None, None].unbind(-1)
-    return x, y
 
 
 def corner_radius(focal: Tensor, center: Tensor, height: int, width: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Sets of real lenses to draw from: a list of cameras, or one camera with a jitter or a covariance."""
+"""Sets of real lenses to draw from: a list of cameras, or those near one camera."""
 
 import math
 from collections.abc import Sequence
@@ -83,8 +83,8 @@ def lenses_from_cameras(table: Sequence[Camera] | None, *, residual_px: float) -
     return LensSource(tuple(map(_numbers, cameras)))
 
 
-def jittered_camera(camera: Camera, *, jitter: float, residual_px: float) -> LensSource:
-    """Vary each number of a camera independently.
+def ranges_around(camera: Camera, *, jitter: float, residual_px: float) -> dict[str, Range]:
+    """Return the range of each number of cameras near one, by the argument names of `LensDistortion`.
 
     Args:
         camera, residual_px: as for `as_polynomial`.
@@ -92,7 +92,7 @@ def jittered_camera(camera: Camera, *, jitter: float, residual_px: float) -> Len
     """
     jitter = check_number("jitter", jitter, low=0.0, high=0.99)
     lens = _numbers(as_polynomial("camera", camera, check_number("residual_px", residual_px, low=0.0)))
-    return LensSource((lens,), tuple(tuple(jitter * abs(n) * (i == j) for j in range(16)) for i, n in enumerate(lens)))
+    return {f"{name}_range": (n - jitter * abs(n), n + jitter * abs(n)) for name, n in zip(_NAMES, lens, strict=True)}
 
 
 def camera_with_covariance(camera: Camera, covariance: Any, *, residual_px: float) -> LensSource:

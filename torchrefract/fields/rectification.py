@@ -1,7 +1,6 @@
 """The flow that shows frames of a camera of any model as a pinhole would have taken them, and the flow back."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.projection import columns, image_of, on_plane, radius_within, ray_of
 from torchrefract.fields import lens
 from torchrefract.fields.filled_frame import MARGIN_PX, border_points
-from torchrefract.fields.lens import REACH, border_on_plane, corner_radius
+from torchrefract.fields.lens import REACH, corner_radius
 from torchrefract.fields.lens_error import cell_lines, flow_bounds, outermost_nodes, with_zoom
 from torchrefract.types import FlowBounds, Simplification
 from torchrefract.warping.grid import Points
@@ -71,9 +70,9 @@ def is_border_missing(
     coefficients: Tensor, focal: Tensor, center: Tensor, *, model: str, height: int, width: int
 ) -> Tensor:
     """Return (B,), bool: the camera does not show part of the border of the pinhole's frame."""
-    x, y = (axis.detach().flatten(1) for axis in border_on_plane(focal, center, height, width))
-    reach = REACH * corner_radius(focal.detach(), center.detach(), height, width)
-    return ~_project(coefficients, x, y, model, reach)[2].all(dim=1)
+    border, focal, center = border_points(height, width, [0.0], focal), focal.detach(), center.detach()
+    reach = REACH * _corner(focal, center, border)
+    return ~_project(coefficients, *_on_plane(border, focal, center), model, reach)[2].all(dim=1)
 
 
 def camera_flow(camera: Camera, *, zoom: float = 1.0) -> tuple[Tensor, Tensor, Camera]:
@@ -162,7 +161,6 @@ class RectificationErrorModel:
         return ((values - numbers).abs() <= _CLOSE * numbers.abs()).all()
 
 
-@lru_cache(maxsize=64)
 def _measure(camera: Camera) -> FlowBounds | None:
     for num_levels in (5, 3, 2, 1):
         lines = cell_lines(camera.height, camera.width, num_levels)

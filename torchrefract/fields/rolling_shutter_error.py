@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -61,7 +60,46 @@ class RollingShutterErrorModel:
         With forward motion alone x + u = c + (x - c) (1 - v t / Z) at the end of each row, likewise y: linear along x,
         and along y as smooth as t / Z. Vibration adds sines of t and the perspective of small angles.
         """
-        return _bounds(self, height, width)
+        if not isinstance(self.depth, DepthProvider):
+            return None
+        depth = self.depth(height, width, dtype=torch.float64, device=torch.device("cpu"))
+        if depth.shape[3] > 1:
+            return None
+        (fx, fy), (cx, cy) = pinhole_of(self.camera, height=height, width=width)
+        reach_x, reach_y = (max(abs(c), abs(size - 1 - c)) for c, size in ((cx, width), (cy, height)))
+        focal = max(fx, fy)
+        stretch = 1 + (reach_x / fx) ** 2 + (reach_y / fy) ** 2  # of angles, far from the axis
+        # Sines at any time: their difference is at most 2, and at most the change of phase.
+        turned = math.sqrt(self.num_frequencies) * np.array(self.amplitude)
+        angle = float(turned.sum()) * min(2.0, 2 * math.pi * self.frequency * (self.readout / 2 + self.moment))
+        step = 2 * math.pi * self.frequency * self.readout / height  # rad of phase per row
+        if angle > 0.2:
+            return None
+        # Way over depth at each row, for the time of the row and for that of the exposure.
+        inverse = 1 / depth[0, 0, :, 0].clamp(min=1e-6).numpy()
+        times = ((np.arange(height) - (height - 1) / 2) * (self.readout / height), np.full(height, self.moment))
+        profiles = [self.speed * time * inverse for time in times]
+        share = sum(float(np.abs(profile).max()) for profile in profiles)
+        way = self.speed * (self.readout / 2 + self.moment)
+        slope = way * reach_y * _steepest(inverse)
+        if share > _LARGEST_SHARE or slope > _LARGEST_SHARE:
+            return None
+        # Of each row: the largest distance from the principal point, and its growth, as the depth is that at the end.
+        distance = np.hypot(reach_x, np.arange(height) - cy)
+        time = sum(map(np.abs, times))
+        grown = distance / (1 - self.speed * time * np.abs(np.arange(height) - cy) * _steepest(inverse))
+        moved = share * float(grown.max()) + angle * focal * stretch
+        gradient = share + float(grown.max()) * sum(map(_steepest, profiles))
+        gradient += step * float(turned.sum()) * focal * stretch + 4 * angle * stretch
+        measured = [_interpolation_error(profile, grown) for profile in profiles]
+        # Per px^4, along columns the sines, along rows and columns perspective.
+        fourth = focal * stretch * float(turned.sum()) * step**4 + 24 * angle * stretch**2 / focal**3
+
+        def interpolation_error(strides: np.ndarray) -> np.ndarray:
+            between = _SAFETY * sum(error(strides) for error in measured)
+            return np.where(strides > _LARGEST_STRIDE, np.inf, between + _FOURTH * fourth * strides**4)
+
+        return FlowBounds(moved, gradient, interpolation_error)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification:
         """Leave out nothing; a small frame is computed at every pixel, since a lattice saves no time."""
@@ -79,50 +117,6 @@ class RollingShutterErrorModel:
                 return torch.zeros((), dtype=torch.bool, device=values.device)
             inside.append(in_ranges(values, ranges))
         return torch.stack(inside).all()
-
-
-@lru_cache(maxsize=256)
-def _bounds(model: RollingShutterErrorModel, height: int, width: int) -> FlowBounds | None:
-    if not isinstance(model.depth, DepthProvider):
-        return None
-    depth = model.depth(height, width, dtype=torch.float64, device=torch.device("cpu"))
-    if depth.shape[3] > 1:
-        return None
-    (fx, fy), (cx, cy) = pinhole_of(model.camera, height=height, width=width)
-    reach_x, reach_y = (max(abs(c), abs(size - 1 - c)) for c, size in ((cx, width), (cy, height)))
-    focal = max(fx, fy)
-    stretch = 1 + (reach_x / fx) ** 2 + (reach_y / fy) ** 2  # of angles, far from the axis
-    # Sines at any time: their difference is at most 2, and at most the change of phase.
-    turned = math.sqrt(model.num_frequencies) * np.array(model.amplitude)
-    angle = float(turned.sum()) * min(2.0, 2 * math.pi * model.frequency * (model.readout / 2 + model.moment))
-    step = 2 * math.pi * model.frequency * model.readout / height  # rad of phase per row
-    if angle > 0.2:
-        return None
-    # Way over depth at each row, for the time of the row and for that of the exposure.
-    inverse = 1 / depth[0, 0, :, 0].clamp(min=1e-6).numpy()
-    times = ((np.arange(height) - (height - 1) / 2) * (model.readout / height), np.full(height, model.moment))
-    profiles = [model.speed * time * inverse for time in times]
-    share = sum(float(np.abs(profile).max()) for profile in profiles)
-    way = model.speed * (model.readout / 2 + model.moment)
-    slope = way * reach_y * _steepest(inverse)
-    if share > _LARGEST_SHARE or slope > _LARGEST_SHARE:
-        return None
-    # Of each row: the largest distance from the principal point, and its growth, since the depth is that at the end.
-    distance = np.hypot(reach_x, np.arange(height) - cy)
-    time = sum(map(np.abs, times))
-    grown = distance / (1 - model.speed * time * np.abs(np.arange(height) - cy) * _steepest(inverse))
-    moved = share * float(grown.max()) + angle * focal * stretch
-    gradient = share + float(grown.max()) * sum(map(_steepest, profiles))
-    gradient += step * float(turned.sum()) * focal * stretch + 4 * angle * stretch
-    measured = [_interpolation_error(profile, grown) for profile in profiles]
-    # Per px^4, along columns the sines, along rows and columns perspective.
-    fourth = focal * stretch * float(turned.sum()) * step**4 + 24 * angle * stretch**2 / focal**3
-
-    def interpolation_error(strides: np.ndarray) -> np.ndarray:
-        between = _SAFETY * sum(error(strides) for error in measured)
-        return np.where(strides > _LARGEST_STRIDE, np.inf, between + _FOURTH * fourth * strides**4)
-
-    return FlowBounds(moved, gradient, interpolation_error)
 
 
 def _steepest(profile: np.ndarray) -> float:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torchrefract._tensor import in_bands
 from torchrefract._validation import check_values, eager_values, requires_grad, why_not_eager
 
 # Control points closer than this share of their extent count as equal.
@@ -79,17 +80,16 @@ def spline_flow(spline: Spline, x: Tensor, y: Tensor, *, dtype: torch.dtype) -> 
     x, y = (((axis.double()[:, 0] - spline.center[..., i : i + 1]) / spline.scale) for i, axis in enumerate((x, y)))
     height = y.shape[1]
     at_once = max(1, _VALUES_AT_ONCE // max(1, spline.points.shape[1] * x.shape[2] * len(x)))
-    if at_once >= height or torch.compiler.is_compiling():
-        return _evaluate(*spline[:3], x, y).to(dtype)
+    if torch.compiler.is_compiling():
+        at_once = height
     # Kernels of all positions would need gigabytes; their gradients compute them again.
-    recompute = requires_grad((*spline[:3], x, y)) and why_not_eager(x) is None
-    bands = []
-    for start in range(0, height, at_once):
-        rows = slice(start, start + at_once)
-        values = (*spline[:3], x if x.shape[1] == 1 else x[:, rows], y[:, rows])
-        band = checkpoint(_evaluate, *values, use_reentrant=False) if recompute else _evaluate(*values)
-        bands.append(band.to(dtype))
-    return torch.cat(bands, dim=2)
+    recompute = at_once < height and requires_grad((*spline[:3], x, y)) and why_not_eager(x) is None
+
+    def at_rows(start: int, stop: int) -> Tensor:
+        values = (*spline[:3], x if x.shape[1] == 1 else x[:, start:stop], y[:, start:stop])
+        return (checkpoint(_evaluate, *values, use_reentrant=False) if recompute else _evaluate(*values)).to(dtype)
+
+    return in_bands(at_rows, length=height, band=at_once, dim=2)
 
 
 def check_points(points: Tensor) -> None:

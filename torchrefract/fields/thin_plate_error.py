@@ -101,7 +101,6 @@ class _UnitSplines(NamedTuple):
     between: np.ndarray  # (n, 2), px: a lattice four times as fine, or some of it
 
 
-@lru_cache(maxsize=64)
 def _unit_splines(lattice: tuple[int, int], smoothing: float, height: int, width: int) -> _UnitSplines:
     at = _lattice_points(lattice, height, width)
     rows, columns = lattice

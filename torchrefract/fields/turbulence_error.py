@@ -64,11 +64,56 @@ class RandomFieldErrorModel:
 
     def bounds(self, height: int, width: int) -> FlowBounds:
         """Return bounds of the displacement and, if pixels resolve the field, of its derivatives."""
-        return _bounds(self)
+        largest, steep = _SIGMAS * self.amplitude[1], _DERIVATIVE_SIGMAS * self.amplitude[1]
+        spectrum = _spectrum(self)
+        if spectrum is None:
+            gradient = math.inf
+            if not self.is_stream:
+                shortest, narrowest = (
+                    torch.tensor([ends[0]], dtype=torch.float64, device="cpu") for ends in (self.length, self.aperture)
+                )
+                gradient = _NARROW_APERTURE * steep
+                gradient *= gradient_rms(shortest, kind=self.covariance, aperture=narrowest).item()
+            return FlowBounds(largest, gradient)
+
+        def interpolation_error(strides: np.ndarray) -> np.ndarray:
+            spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)
+            power = _cubic_error(spacing, is_stream=self.is_stream) @ spectrum.weight
+            return _SKEW * spectrum.margin * largest * np.sqrt(power)
+
+        return FlowBounds(largest, steep * _gradient_rms(spectrum, is_stream=self.is_stream), interpolation_error)
 
     def simplify(self, height: int, width: int, budget_px: float) -> Simplification | None:
         """Keep the lowest frequencies, so that the others use a share of the budget."""
-        return _simplify(self, height, width, budget_px)
+        largest = _SIGMAS * self.amplitude[1]
+        if largest > min(height, width):
+            return Simplification(0.0, can_interpolate=False, why="the flow is longer than the frame")
+        spectrum = _spectrum(self)
+        if spectrum is None:
+            return Simplification(0.0, can_interpolate=False, why="the field has too many frequencies for a lattice")
+        allowed = _DROPPED_SHARE * budget_px
+        cutoff = _cutoff(spectrum, allowed / largest, is_stream=self.is_stream)
+        # The stream function has one row and one column more on each side of the frame.
+        sides = [side + (2 if self.is_stream else 0) for side in (height, width)]
+        reach = REACH[self.covariance] * self.length[1]
+        size = embedding_size(*sides, kind=self.covariance, length=self.length[1], aperture=self.aperture[1])
+        frequencies = Frequencies(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
+        count = math.prod(frequencies.counts)
+        has_fewer = all(2 * largest + 1 < n for largest, n in zip(frequencies[1:], size, strict=True))
+        if self.covariance == "gaussian":
+            # The covariance is summed over the ways around the domain only if that is large enough.
+            is_cheaper, has_room = count <= _MAX_FREQUENCIES, reach <= min(size)
+        else:
+            # The transform of all frequencies warns if the domain is too small.
+            is_cheaper = count <= _MAX_SHARE * math.prod(size)
+            has_room = all(side + reach <= n for side, n in zip(sides, size, strict=True))
+        if not (has_fewer and is_cheaper and has_room):
+            return Simplification(0.0, can_interpolate=False, why="the field has too many frequencies for a lattice")
+        return Simplification(
+            math.hypot(allowed, _ROUNDING * largest),
+            details=frequencies,
+            why="{} x {} of {} x {} frequencies".format(*frequencies.counts, *size),
+        )
 
     def contains(self, params: Any) -> Tensor:
         """Return (), bool: amplitude, length and aperture of each sample lie in the ranges, up to rounding."""
@@ -77,62 +122,6 @@ class RandomFieldErrorModel:
         return in_ranges(values, [getattr(self, name) for name in names])
 
 
-@lru_cache(maxsize=256)
-def _bounds(model: RandomFieldErrorModel) -> FlowBounds:
-    largest, steep = _SIGMAS * model.amplitude[1], _DERIVATIVE_SIGMAS * model.amplitude[1]
-    spectrum = _spectrum(model)
-    if spectrum is None:
-        gradient = math.inf
-        if not model.is_stream:
-            shortest, narrowest = (
-                torch.tensor([ends[0]], dtype=torch.float64, device="cpu") for ends in (model.length, model.aperture)
-            )
-            gradient = _NARROW_APERTURE * steep
-            gradient *= gradient_rms(shortest, kind=model.covariance, aperture=narrowest).item()
-        return FlowBounds(largest, gradient)
-
-    def interpolation_error(strides: np.ndarray) -> np.ndarray:
-        spacing = np.multiply.outer(np.asarray(strides, dtype=float), spectrum.deviation)
-        power = _cubic_error(spacing, is_stream=model.is_stream) @ spectrum.weight
-        return _SKEW * spectrum.margin * largest * np.sqrt(power)
-
-    return FlowBounds(largest, steep * _gradient_rms(spectrum, is_stream=model.is_stream), interpolation_error)
-
-
-@lru_cache(maxsize=256)
-def _simplify(model: RandomFieldErrorModel, height: int, width: int, budget_px: float) -> Simplification | None:
-    largest = _SIGMAS * model.amplitude[1]
-    if largest > min(height, width):
-        return Simplification(0.0, can_interpolate=False, why="the flow is longer than the frame")
-    spectrum = _spectrum(model)
-    if spectrum is None:
-        return Simplification(0.0, can_interpolate=False, why="the field has too many frequencies for a lattice")
-    allowed = _DROPPED_SHARE * budget_px
-    cutoff = _cutoff(spectrum, allowed / largest, is_stream=model.is_stream)
-    # The stream function has one row and one column more on each side of the frame.
-    sides = [side + (2 if model.is_stream else 0) for side in (height, width)]
-    reach = REACH[model.covariance] * model.length[1]
-    size = embedding_size(*sides, kind=model.covariance, length=model.length[1], aperture=model.aperture[1])
-    frequencies = Frequencies(size, *(math.ceil(cutoff * n / (2 * math.pi)) for n in size))
-    count = math.prod(frequencies.counts)
-    has_fewer = all(2 * largest + 1 < n for largest, n in zip(frequencies[1:], size, strict=True))
-    if model.covariance == "gaussian":
-        # The covariance is summed over the ways around the domain only if that is large enough.
-        is_cheaper, has_room = count <= _MAX_FREQUENCIES, reach <= min(size)
-    else:
-        # The transform of all frequencies warns if the domain is too small.
-        is_cheaper = count <= _MAX_SHARE * math.prod(size)
-        has_room = all(side + reach <= n for side, n in zip(sides, size, strict=True))
-    if not (has_fewer and is_cheaper and has_room):
-        return Simplification(0.0, can_interpolate=False, why="the field has too many frequencies for a lattice")
-    return Simplification(
-        math.hypot(allowed, _ROUNDING * largest),
-        details=frequencies,
-        why="{} x {} of {} x {} frequencies".format(*frequencies.counts, *size),
-    )
-
-
-@lru_cache(maxsize=256)
 def _spectrum(model: RandomFieldErrorModel) -> _Spectrum | None:
     """Return the spectrum of the roughest field, or None if pixels do not resolve it."""
     weight, scale = (values.numpy() for values in gaussian_mixture(model.covariance, torch.device("cpu")))

@@ -12,9 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchrefract._tensor import (
-    as_device_tensor,
     assume_constant_result,
-    cached_constant,
     exact_matmul,
     has_memory_format,
     is_channels_last,
@@ -41,8 +39,10 @@ _SUPPORTED = {
 
 def sample(
     image: Tensor,
-    flow: Tensor,
+    nodes: Tensor,
     *,
+    stride: int = 1,
+    margin: int = 0,
     padding: str,
     interpolation: str,
     backend: str = "auto",
@@ -52,7 +52,11 @@ def sample(
 
     Args:
         image: (N, C, H, W), of any real type. Integers are rounded and clamped, half types are sampled in float32.
-        flow: (N or 1, 2, H, W), px. NaN and infinity count as a position outside.
+        nodes: (N or 1, 2, h, w), px, the flow at the nodes of a lattice, with cubics between them; by default at the
+            pixels. Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride. NaN and infinity count as a
+            position outside.
+        stride: px, between nodes.
+        margin: nodes before the first pixel, at least 1, or 0 with stride 1.
         padding: "zeros", "border" or "reflection".
         interpolation: "nearest", "bilinear" or "bicubic", which is clamped to the range of the image's values.
         backend: "torch", "numba", "triton", or "auto" for the fastest one that supports the arguments. Where a
@@ -67,65 +71,30 @@ def sample(
     """
     if image.numel() == 0:
         return image.clone()
-    dtype = sampling_dtype(image, flow.dtype)
-    flow = flow.to(dtype)
-    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": False}
-    numba = _chosen("numba", image, flow, **choice)
-    if numba is not None:
-        source = image if image.dtype is torch.uint8 else image.to(dtype)
-        options = {"margin": 0, "padding": padding, "limit": DENSE_LIMIT, "active": active}
-        return _like(numba.sample_lattice(source, flow, None, **options), image)
-    _chosen("triton", image, flow, **choice)  # raises if the caller chose it
-    return _by_torch(image, sampler_grid(flow), dtype, padding=padding, interpolation=interpolation, active=active)
-
-
-def sample_lattice(
-    image: Tensor,
-    nodes: Tensor,
-    *,
-    stride: int,
-    margin: int,
-    padding: str,
-    interpolation: str,
-    backend: str = "auto",
-    active: Tensor | None = None,
-) -> Tensor:
-    """Sample an image at p + flow(p), for a flow at the nodes of a lattice with cubics between them.
-
-    Args:
-        image: (N, C, H, W), as for `sample`.
-        nodes: (N or 1, 2, h, w), px. Node (i, j) lies at x = (j - margin) stride, y = (i - margin) stride.
-        stride: px, between nodes.
-        margin: nodes before the first pixel, at least 1, or 0 with stride 1.
-        padding, interpolation, backend, active: as for `sample`.
-
-    Returns:
-        (N, C, H, W), of the type and the memory format of the image.
-
-    Raises:
-        ValueError: the backend does not support the arguments.
-    """
     height, width = image.shape[2:]
-    lattice = {"stride": stride, "margin": margin}
-    if image.numel() == 0 or stride == 1:
-        flow = interpolate_nodes(nodes, **lattice, height=height, width=width)
-        return sample(image, flow, padding=padding, interpolation=interpolation, backend=backend, active=active)
+    lattice = {"stride": stride, "margin": margin, "height": height, "width": width}
+    if stride == 1:
+        nodes, margin = interpolate_nodes(nodes, **lattice), 0
     dtype = sampling_dtype(image, nodes.dtype)
-    nodes, limit = nodes.to(dtype), LATTICE_LIMIT
-    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": True}
+    nodes, limit = nodes.to(dtype), LATTICE_LIMIT if stride > 1 else DENSE_LIMIT
     fast = backend if backend in _MODULES else "triton" if image.is_cuda else "numba"
+    choice = {"backend": backend, "interpolation": interpolation, "is_lattice": stride > 1}
     module = _chosen(fast, image, nodes, **choice)
     if module is not None:
         source = image if fast == "numba" and image.dtype is torch.uint8 else image.to(dtype)
-        weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
+        weights = None
+        if stride > 1:
+            weights = lagrange_weights(stride, dtype=dtype, device=nodes.device)
+            nodes = _finite(nodes, limit * max(height, width))
         options = {"margin": margin, "padding": padding, "limit": limit, "active": active}
-        nodes = _finite(nodes, limit * max(height, width))
         return _like(module.sample_lattice(source, nodes, weights, **options), image)
-    # The positions of the pixels are linear, so the cubics keep them when they are added at the nodes.
-    start = -margin * stride
-    y, x = (start + stride * torch.arange(n, dtype=dtype, device=nodes.device) for n in nodes.shape[2:])
-    positions = _finite(_to_sampler(nodes, x, y[:, None], height=height, width=width), limit)
-    grid = interpolate_nodes(positions, **lattice, height=height, width=width).movedim(1, -1)
+    if stride == 1:
+        grid = sampler_grid(nodes)
+    else:
+        # The positions of the pixels are linear, so the cubics keep them when they are added at the nodes.
+        y, x = (stride * (torch.arange(n, dtype=dtype, device=nodes.device) - margin) for n in nodes.shape[2:])
+        positions = _finite(_to_sampler(nodes, x, y[:, None], height=height, width=width), limit)
+        grid = interpolate_nodes(positions, **lattice).movedim(1, -1)
     return _by_torch(image, grid, dtype, padding=padding, interpolation=interpolation, active=active)
 
 
@@ -175,7 +144,8 @@ def lagrange_weights(stride: int, *, dtype: torch.dtype, device: torch.device) -
     Returns:
         (stride, 4).
     """
-    return as_device_tensor(_constant_weights(stride), dtype=dtype, device=device)
+    t = torch.arange(stride, dtype=torch.float64, device=device) / stride
+    return torch.stack(lagrange_basis(t), dim=1).to(dtype)
 
 
 def lagrange_basis(t: Any) -> list[Any]:
@@ -212,17 +182,6 @@ def interpolate_nodes(nodes: Tensor, *, stride: int, margin: int, height: int, w
         lines = exact_matmul(nodes.unfold(3, 4, 1), weights.mT).flatten(3)[..., :width]
         # One product a cell: with a matrix on the left, matmul would copy the lines to fold them into one matrix.
         return exact_matmul(weights[None], lines.unfold(2, 4, 1).mT).flatten(2, 3)[:, :, :height]
-
-
-@assume_constant_result
-def _constant_weights(stride: int) -> list[list[float]]:
-    return _cached_weights(stride)  # called indirectly, since torch.compile warns of caches that it traces
-
-
-@cached_constant(maxsize=64)
-def _cached_weights(stride: int) -> list[list[float]]:
-    t = torch.arange(stride, dtype=torch.float64, device="cpu") / stride
-    return torch.stack(lagrange_basis(t), dim=1).tolist()
 
 
 def _num_parts(source: Tensor, pixels: int) -> int:
@@ -277,7 +236,10 @@ def _like(values: Tensor, image: Tensor) -> Tensor:
 
 
 def _chosen(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolation: str, is_lattice: bool) -> Any:
-    """Return the module of a backend that samples the image, or None; raise if the caller chose it and it cannot."""
+    """Return the module of a backend that samples the image, or None; raise if the caller chose it and it cannot.
+
+    The flow is of the `sampling_dtype` of the image.
+    """
     if backend not in ("auto", name) or requires_grad((image, flow)):
         return None
     if backend == "auto" and (name == "triton") != image.is_cuda:
@@ -289,7 +251,7 @@ def _chosen(name: str, image: Tensor, flow: Tensor, *, backend: str, interpolati
         why = f"{interpolation} interpolation"
     elif not is_lattice and name == "triton":
         why = "a dense flow"
-    elif sampling_dtype(image, flow.dtype) is torch.float64:
+    elif flow.dtype is torch.float64:
         why = f"{str(image.dtype).removeprefix('torch.')} of {tuple(image.shape[2:])} px, which needs float64"
     elif name == "numba":
         why = why_not_eager(image) or why_not_eager(flow)

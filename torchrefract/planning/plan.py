@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrefract._tensor import cached_constant
 from torchrefract._validation import check_number
 from torchrefract.types import FlowBounds, Simplification
-from torchrefract.warping.lattice import Lattice
 
 TOLERANCE_PX = 0.02  # the default of all warps; an error of this size is invisible
 EXACT_AT_NODES = "exact, at the nodes of the composed flow"  # the reason of warps in closed form
@@ -72,10 +71,13 @@ class PlanRequest:
         """Return True if rounding leaves at least half of the tolerance."""
         return self.tolerance_px is None or self.tolerance_px >= 2 * self.rounding_px
 
+    def if_reachable(self) -> "PlanRequest":
+        """Drop a tolerance that rounding exceeds."""
+        return self if self.is_reachable else replace(self, tolerance_px=None)
+
     def with_reachable_default(self) -> "PlanRequest":
         """Drop the default tolerance in frames so large that rounding exceeds it."""
-        unreachable_default = self.tolerance_px == TOLERANCE_PX and not self.is_reachable
-        return replace(self, tolerance_px=None) if unreachable_default else self
+        return self.if_reachable() if self.tolerance_px == TOLERANCE_PX else self
 
     def remaining_px(self) -> float:
         """Return the part of the tolerance that rounding leaves, in px.
@@ -207,17 +209,9 @@ def coarsest_stride(bounds: FlowBounds, simplified: Simplification, budget_px: f
         return 1
     between = bounds.interpolation_error(_STRIDES)
     total = np.hypot(simplified.error_px, between) if is_random else simplified.error_px + between
-    fitting = np.flatnonzero(total <= budget_px)
     # The error grows with the stride: only strides below the first one that does not fit count.
-    too_coarse = np.flatnonzero(~(total <= budget_px))
-    if len(too_coarse):
-        fitting = fitting[fitting < too_coarse[0]]
-    return STRIDES[fitting[-1]] if len(fitting) else 1
-
-
-def lattice_with_stride(height: int, width: int, stride: int) -> Lattice:
-    """Return the pixels for strides of 0 and 1, otherwise a lattice with one node more on each side."""
-    return Lattice(height, width, stride, 1) if stride > 1 else Lattice(height, width, 1, 0)
+    count = np.logical_and.accumulate(total <= budget_px).sum()
+    return STRIDES[count - 1] if count else 1
 
 
 def check_tolerance(value: float | None, *, name: str = "tolerance_px") -> float | None:

@@ -5,10 +5,11 @@ from torch import Tensor
 
 from torchrefract._tensor import rows_at_once
 from torchrefract._validation import check_count, check_flow, check_positive, eager_values, requires_grad
-from torchrefract.ops.sampling import grid_sample, sample, sampling_dtype
+from torchrefract.ops.sampling import grid_sample, sampling_dtype
 from torchrefract.warping.flow import Jacobian
 from torchrefract.warping.grid import field_dtype, inside, pixel_axes
 from torchrefract.warping.implicit import LinearSample, implicit, sample_linear
+from torchrefract.warping.warp import sees_only_valid
 
 # Px, and units in the last place of the longer side: a pixel with a smaller residual takes no further step.
 _SOLVED_PX, _SOLVED_ULPS = {torch.float32: 2e-5, torch.float64: 1e-11}, 4
@@ -68,7 +69,7 @@ def invert_flow(flow: Tensor, *, steps: int = 8, tolerance_px: float = 0.05) -> 
         valid = (residual <= tolerance_px) & (determinant > 0) & inside(solution)
         if has_holes:
             # The inverse is unknown where it samples a hole of the flow.
-            valid = valid & is_finite & (_sample(is_finite.to(flow.dtype), solution) > 0.999)
+            valid = valid & is_finite & sees_only_valid(is_finite, solution)
     if requires_grad((flow,)):
         # A pixel without a solution keeps the last iterate, which has no derivative.
         inverse = torch.cat(implicit(solution.split(1, dim=1), (flow,), _error), dim=1)
@@ -247,13 +248,3 @@ def _sample_at(field: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> Tensor:
     u, v = shift.split(1, dim=1)
     grid = torch.cat([torch.add(x, u, alpha=2 / width), torch.add(y, v, alpha=2 / height)], dim=1).movedim(1, -1)
     return grid_sample(field, grid, padding="border", interpolation="bilinear")
-
-
-def residual_of(flow: Tensor, inverse: Tensor) -> Tensor:
-    """Return |inverse(p) + flow(p + inverse(p))|, (B, 1, H, W), px, without gradient."""
-    flow, inverse = flow.detach(), inverse.detach()
-    return _squared_length(_sample(flow, inverse) + inverse).sqrt_()
-
-
-def _sample(field: Tensor, flow: Tensor) -> Tensor:
-    return sample(field, flow, padding="border", interpolation="bilinear")

@@ -53,6 +53,11 @@ def pixel_lattice(height: int, width: int) -> Lattice:
     return Lattice(height, width, stride=1, margin=0)
 
 
+def lattice_with_stride(height: int, width: int, stride: int, *, margin: int = 1) -> Lattice:
+    """Return the lattice of the pixels for strides of 0 and 1, otherwise one with a margin."""
+    return Lattice(height, width, stride, margin) if stride > 1 else pixel_lattice(height, width)
+
+
 @dataclass(frozen=True)
 class LatticeFlow:
     """Hold a flow at the nodes of a lattice; cubic polynomials through four nodes along each axis interpolate it.
@@ -135,7 +140,7 @@ def _in_strides(position: Tensor, lattice: Lattice, count: int) -> Tensor:
 def _cells(index: Tensor, count: int, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
     """Return the first of the four nodes around each fractional index, int64, and the weights of the four."""
     second = index.detach().clamp(1, count - 3).long()
-    return second - 1, [weight.to(dtype) for weight in lagrange_basis(index - second)]
+    return second - 1, lagrange_basis((index - second).to(dtype))
 
 
 def _cubic(nodes: Tensor, x: Tensor, y: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from torchrefract._validation import check_choice, check_flow, check_tensor
-from torchrefract.ops.sampling import BACKENDS, INTERPOLATIONS, PADDINGS, sample, sample_lattice
+from torchrefract.ops.sampling import BACKENDS, INTERPOLATIONS, PADDINGS, sample
 from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.lattice import LatticeFlow
 
@@ -80,7 +80,7 @@ def sample_image(
     options = {"padding": padding, "interpolation": interpolation, "backend": backend, "active": active}
     if isinstance(flow, Tensor):
         return sample(image, flow, **options)
-    return sample_lattice(image, flow.nodes, stride=flow.lattice.stride, margin=flow.lattice.margin, **options)
+    return sample(image, flow.nodes, stride=flow.lattice.stride, margin=flow.lattice.margin, **options)
 
 
 def sees_only_valid(valid: Tensor, flow: Tensor) -> Tensor:

@@ -313,13 +313,9 @@ def test_the_last_checkpoint_is_that_of_the_last_epoch_even_if_the_best_is_earli
     kept = [instantiate(callback) for callback in callbacks if "ModelCheckpoint" in callback._target_]
     batches = DataLoader(TensorDataset(torch.ones(2, 1)), batch_size=1)
     options: Any = {"accelerator": "cpu", "logger": False, "enable_progress_bar": False, "num_sanity_val_steps": 0}
-    trainer = Trainer(max_epochs=3, callbacks=kept, enable_model_summary=False, **options)
-    trainer.fit(Worsening(), batches, batches)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "last.ckpt"]
-    for name, epoch in (("best", 0), ("last", 2)):
-        assert torch.load(tmp_path / f"{name}.ckpt", weights_only=True)["epoch"] == epoch
-    resumed = Trainer(max_epochs=4, callbacks=[*map(copy, kept)], enable_model_summary=False, **options)
-    resumed.fit(Worsening(), batches, batches, ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "last.ckpt"]
-    for name, epoch in (("best", 0), ("last", 3)):
-        assert torch.load(tmp_path / f"{name}.ckpt", weights_only=True)["epoch"] == epoch
+    for max_epochs, resumed in ((3, None), (4, str(tmp_path / "last.ckpt"))):
+        trainer = Trainer(max_epochs=max_epochs, callbacks=[*map(copy, kept)], enable_model_summary=False, **options)
+        trainer.fit(Worsening(), batches, batches, ckpt_path=resumed, weights_only=resumed is not None)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "last.ckpt"]
+        for name, epoch in (("best", 0), ("last", max_epochs - 1)):
+            assert torch.load(tmp_path / f"{name}.ckpt", weights_only=True)["epoch"] == epoch

@@ -3,20 +3,26 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
-from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from pictures import (
+    files_in,
+    load_clip,
+    load_picture,
+    save_media,
+    save_picture,
+    save_turned,
+    smooth_picture,
+    sound_of,
+    times_of,
+)
+from processes import running, wait_for
 from pycocotools.coco import COCO
 
 from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
@@ -30,28 +36,11 @@ NAMES = ("a.png", "one/b.png", "one/two/c.bmp")
 TIMES_MS = (0, 40, 80, 600)
 
 
-def picture(height: int = 48, width: int = 96, seed: int = 0) -> np.ndarray:
-    """Return (H, W, 3), uint8, smooth enough for a video codec."""
-    y, x = np.mgrid[:height, :width]
-    waves = [127 + 100 * np.sin(x / (9 + c) + seed) * np.cos(y / (11 - c)) for c in range(3)]
-    return np.stack(waves, axis=-1).astype(np.uint8)
-
-
-def write(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), pixels)
-
-
-def written(folder: Path) -> list[str]:
-    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return sorted(file for file in files if not file.startswith("."))
-
-
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """Write pictures into raw/ and return the working folder."""
     for i, name in enumerate(NAMES):
-        write(tmp_path / "raw" / name, picture(width=96 + 32 * i, seed=i))
+        save_picture(tmp_path / "raw" / name, smooth_picture(width=96 + 32 * i, seed=i))
     return tmp_path
 
 
@@ -67,14 +56,13 @@ def test_pictures_keep_their_names_and_are_drawn_by_them(call, folder):
     outcome = call("degrade", *WORDS, "seed=5")
     assert outcome.out.splitlines()[0] == "out: 3 degraded, 0 already existed, 0 skipped"
     assert (outcome.code, outcome.err) == (0, "")
-    assert written(folder / "out") == sorted([*NAMES, "config.json"])
+    assert files_in(folder / "out") == sorted([*NAMES, "config.json"])
     settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
     assert settings["scene"] == {"_target_": "torchrefract.presets.cheap_dashcam", "severity": 4}
     assert (settings["source"], settings["seed"]) == (str(folder / "raw"), 5)
     for name in NAMES:
         expected = degraded(folder, name, presets.cheap_dashcam(4), seed=5).image[0]
-        result = np.asarray(cv2.imread(str(folder / "out" / name)))[..., ::-1]
-        assert np.abs(result / 255 - expected.movedim(0, -1).numpy()).max() < 0.51 / 255 + 1e-5
+        assert (read_image(folder / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-5
     # A file keeps its draw if it is the only one.
     (folder / "raw" / "a.png").unlink()
     assert call("degrade", *WORDS, "seed=5", "out=more").code == 0
@@ -94,23 +82,17 @@ def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder)
 
 
 def test_ctrl_c_while_the_processes_start_is_one_line(folder):
-    command = [sys.executable, "-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    options = {"cwd": folder, "env": environment, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    # A shell lets programs in the background ignore it.
-    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(command, **options) as process:
-        try:
-            end = time.monotonic() + 120
-            while not (folder / "later").exists() and process.poll() is None and time.monotonic() < end:
-                time.sleep(0.02)
-            time.sleep(1)  # the server of the processes imports the package, which takes seconds
-            os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
-            _, message = process.communicate(timeout=60)
-        finally:
-            process.kill()
+    with running("-m", "torchrefract.degrade", *WORDS, "out=later", "workers=1", cwd=folder) as process:
+        wait_for((folder / "later").exists, process)
+        time.sleep(1)  # the server of the processes imports the package, which takes seconds
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it
+        _, message = process.communicate(timeout=60)
     assert process.returncode == 130
-    lines = [line for line in message.splitlines() if not line.startswith(("warning: ", "torchrefract: loading"))]
+    lines = [
+        line
+        for line in message.splitlines()
+        if not line.startswith(("warning: ", "torchrefract: loading", "degrading: "))
+    ]
     assert lines == ["stopped; the same command continues"]
 
 
@@ -128,7 +110,7 @@ def test_displacements_scale_with_the_width_of_each_picture_unless_a_width_is_gi
 
 
 def test_flows_beyond_the_range_of_a_png_are_warned_of(call, folder):
-    write(folder / "raw" / "a" / "wide.png", picture(32, 4000))
+    save_picture(folder / "raw" / "a" / "wide.png", smooth_picture(32, 4000))
     (folder / "conf" / "scene").mkdir(parents=True)
     scene = "_target_: torchrefract.LensDistortion\nk1_range: [-0.9, -0.9]\nframe: pad\n"
     (folder / "conf" / "scene" / "mine.yaml").write_text(scene)
@@ -144,7 +126,7 @@ def test_maps_are_those_of_the_effect(call, folder):
     assert call("degrade", *words).code == 0
     stems = [Path(name).with_suffix("").as_posix() for name in NAMES]
     names = [f"images/{name}" for name in NAMES] + [f"maps/{stem}.maps.npz" for stem in stems]
-    assert written(folder / "out") == sorted([*names, "config.json"])
+    assert files_in(folder / "out") == sorted([*names, "config.json"])
     for name, stem in zip(NAMES, stems, strict=True):
         expected = degraded(folder, name, presets.paper_weather())
         with np.load(folder / "out" / "maps" / f"{stem}.maps.npz") as maps:
@@ -159,7 +141,10 @@ def test_fog_takes_depth_maps(call, folder):
     for name in NAMES:
         path = folder / "depth" / Path(name).with_suffix(".npy")
         path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, np.full(picture(width=int(read_image(folder / "raw" / name).shape[2])).shape[:2], 30, np.float32))
+        np.save(
+            path,
+            np.full(read_image(folder / "raw" / name).shape[1:], 30, np.float32),
+        )
     words = ("source=raw", "scene=cape_town_fog", "workers=0")
     assert "depth maps, as estimate_depth writes them, are better" in call("degrade", *words, "out=assumed").err
     outcome = call("degrade", *words, "out=given", "depth=depth")
@@ -172,52 +157,26 @@ def test_fog_takes_depth_maps(call, folder):
 
 def test_files_whose_depth_map_changed_after_they_were_degraded_are_degraded_again(call, folder):
     (folder / "raw" / "one").rename(folder / "one")  # one picture is enough
-    write_video([picture(16, 32)] * 2, folder / "raw" / "c.mp4", fps=10, size=(32, 16))
+    write_video([smooth_picture(16, 32)] * 2, folder / "raw" / "c.mp4", fps=10, size=(32, 16))
     maps = [folder / "depth" / name for name in ("a.png", "c.mp4/000000.png", "c.mp4/000001.png")]
     for path, size in zip(maps, ((48, 96), (16, 32), (16, 32)), strict=True):
-        write(path, np.full(size, 30 * 256, np.uint16))
+        save_picture(path, np.full(size, 30 * 256, np.uint16))
     words = ("source=raw", "scene=cape_town_fog", "workers=0", "out=out", "depth=depth")
     assert call("degrade", *words).code == 0
     before = (folder / "out" / "a.png").read_bytes()
-    write(maps[0], np.full((48, 96), 60 * 256, np.uint16))
+    save_picture(maps[0], np.full((48, 96), 60 * 256, np.uint16))
     assert call("degrade", *words).out.startswith("out: 1 degraded, 1 already existed, 0 skipped")
     assert (folder / "out" / "a.png").read_bytes() != before
-    write(maps[2], np.full((16, 32), 60 * 256, np.uint16))
+    save_picture(maps[2], np.full((16, 32), 60 * 256, np.uint16))
     assert call("degrade", *words).out.startswith("out: 1 degraded, 1 already existed, 0 skipped")
-
-
-def video(path: Path) -> None:
-    """Write a video of unequal times with sound, which a player turns by 90 degrees."""
-    container: Any = av.open(str(path), "w")
-    with container:
-        stream, track = container.add_stream("libx264", rate=25), container.add_stream("aac", rate=48000, layout="mono")
-        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
-        stream.set_display_matrix((0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30))
-        for k, t in enumerate(TIMES_MS):
-            # Later frames are darker: the color of fog must stay that of the first one.
-            pixels = (picture(64, 96, seed=k) * (1 - 0.2 * k)).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame.pts, frame.time_base = t, Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-        wave = (9000 * np.sin(np.arange(10240) / 17)).astype(np.float32)[None] / 32768
-        for start in range(0, 10240, 1024):
-            sound = av.AudioFrame.from_ndarray(wave[:, start : start + 1024], format="fltp", layout="mono")
-            sound.sample_rate, sound.pts = 48000, start
-            container.mux(track.encode(sound))
-        container.mux(track.encode(None))
-
-
-def decoded(path: Path, kind: str) -> list[Any]:
-    container: Any = av.open(str(path))
-    with container:
-        return list(container.decode(**{kind: 0}))
 
 
 @pytest.mark.parametrize("scene", ["cheap_dashcam", "cape_town_fog"])
 def test_a_video_is_one_clip_that_keeps_its_orientation_times_and_sound(call, tmp_path, scene):
-    video(tmp_path / "drive.mov")
+    # Later frames are darker: the color of fog must stay that of the first one.
+    frames = [(smooth_picture(64, 96, seed=k) * (1 - 0.2 * k)).astype(np.uint8) for k in range(4)]
+    quarter_turn = (0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    save_media(tmp_path / "drive.mov", frames, times=TIMES_MS, sound="aac", matrix=quarter_turn)
     words = ("source=drive.mov", "out=out", f"scene={scene}", "severity=5", "workers=0", "maps=npz")
     assert call("degrade", *words).code == 0
     source, target = tmp_path / "drive.mov", tmp_path / "out" / "images" / "drive.mp4"
@@ -229,20 +188,15 @@ def test_a_video_is_one_clip_that_keeps_its_orientation_times_and_sound(call, tm
         with np.load(tmp_path / "out" / "maps" / "drive.mov" / f"{t:06d}.maps.npz") as maps:
             name = "flow" if expected.has("flow") else "transmission"
             np.testing.assert_allclose(maps[name].squeeze(), getattr(expected, name)[0, t].squeeze(), atol=1e-3)
-    first = np.asarray(cv2.VideoCapture(str(target)).read()[1])[..., ::-1]
-    assert np.abs(first / 255 - expected.image[0, 0].movedim(0, -1).numpy()).mean() < 0.02
-    assert [frame.time for frame in decoded(target, "video")] == pytest.approx([t / 1000 for t in TIMES_MS], abs=1e-3)
-    sounds = [np.concatenate([f.to_ndarray() for f in decoded(path, "audio")], axis=1) for path in (source, target)]
-    assert np.array_equal(sounds[0], sounds[1])
+    assert np.abs(load_clip(target)[0] / 255 - expected.image[0, 0].movedim(0, -1).numpy()).mean() < 0.02
+    assert times_of(target) == pytest.approx([t / 1000 for t in TIMES_MS], abs=1e-3)
+    assert np.array_equal(sound_of(source)[1], sound_of(target)[1])
     assert call("degrade", *words).out.startswith("out: 0 degraded, 1 already existed, 0 skipped")
 
 
 def test_a_picture_is_degraded_as_displayed_and_keeps_16_bits(call, tmp_path):
-    (tmp_path / "raw").mkdir()
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(picture()).save(tmp_path / "raw" / "phone.png", exif=exif)
-    write(tmp_path / "raw" / "deep.png", picture().astype(np.uint16) * 257)
+    save_picture(tmp_path / "raw" / "deep.png", smooth_picture().astype(np.uint16) * 257)
+    save_turned(tmp_path / "raw" / "phone.png", smooth_picture(), 6)
     assert call("degrade", *WORDS).code == 0
     for name in ("phone.png", "deep.png"):
         expected = degraded(tmp_path, name, presets.cheap_dashcam(4)).image[0]
@@ -255,7 +209,7 @@ def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, fo
     assert call("degrade", *WORDS).code == 0
     source, target = folder / "raw" / "one" / "b.png", folder / "out" / "one" / "b.png"
     before = target.read_bytes()
-    write(source, 255 - picture())
+    save_picture(source, 255 - smooth_picture())
     assert call("degrade", *WORDS).out.startswith("out: 1 degraded, 2 already existed, 0 skipped")
     assert target.read_bytes() != before
     later = time.time() + 3600
@@ -301,13 +255,13 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_degraded_by_the_next(cal
 def test_an_invalid_option_is_one_line_of_error(call, folder, words, message):
     (folder / "empty").mkdir()
     (folder / "no.png").write_text("no picture")
-    write(folder / "other" / "a.png", picture())
-    before = written(folder)
+    save_picture(folder / "other" / "a.png", smooth_picture())
+    before = files_in(folder)
     given = {word.split("=")[0] for word in words}
     outcome = call("degrade", *(word for word in WORDS if word.split("=")[0] not in given), *words)
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1].startswith(f"error: {message}")
-    assert [name for name in written(folder) if name != "out/config.json"] == before  # nothing is lost
+    assert [name for name in files_in(folder) if name != "out/config.json"] == before  # nothing is lost
 
 
 def coco(folder: Path, **changes: Any) -> Path:
@@ -340,7 +294,7 @@ def test_labels_of_coco_follow_the_flow_of_their_picture_also_after_a_resume(cal
         torch.testing.assert_close(boxes[:, :2], expected[:, :2] + 0.5, atol=2e-3, rtol=0)
         torch.testing.assert_close(boxes[:, 2:], expected[:, 2:] - expected[:, :2], atol=2e-3, rtol=0)
         assert [row["area"] for row in rows] == pytest.approx(boxes[:, 2:].prod(dim=1).tolist(), rel=1e-3)
-        assert labels.loadImgs([7 * i])[0]["file_name"] in written(folder / "out" / "images")
+        assert labels.loadImgs([7 * i])[0]["file_name"] in files_in(folder / "out" / "images")
     # A run that was killed leaves a picture without its line, and a line without its end.
     journal = folder / "out" / ".labels.jsonl"
     lines = journal.read_text().split("\n")
@@ -353,7 +307,7 @@ def test_labels_of_coco_follow_the_flow_of_their_picture_also_after_a_resume(cal
 def test_a_picture_without_result_is_left_out_of_the_labels(call, folder):
     coco(folder)
     (folder / "raw" / "a.png").write_text("no picture")
-    write(folder / "raw" / "new.png", picture())
+    save_picture(folder / "raw" / "new.png", smooth_picture())
     outcome = call("degrade", *WORDS, "labels=boxes.json")
     assert outcome.err.splitlines() == [
         "warning: labels do not list 1 of the files: new.png",
@@ -370,7 +324,7 @@ def test_labels_in_a_folder_are_written_under_the_names_of_their_pictures(call, 
         path = folder / "labels" / Path(name).with_suffix(".txt" if kind == "yolo" else ".png")
         ids = np.zeros(read_image(folder / "raw" / name).shape[1:], np.uint8)
         ids[12:36, 24:72] = 7
-        write(path.with_suffix(".png"), ids)
+        save_picture(path.with_suffix(".png"), ids)
         if kind == "yolo":
             path.with_suffix(".png").unlink()
             path.write_text(f"4 {48 / ids.shape[1]} 0.5 {48 / ids.shape[1]} 0.5\n")
@@ -379,9 +333,9 @@ def test_labels_in_a_folder_are_written_under_the_names_of_their_pictures(call, 
         flow = degraded(folder, name, presets.cheap_dashcam(4)).flow[0]
         path = folder / "out" / "labels" / Path(name).with_suffix(".txt" if kind == "yolo" else ".png")
         if kind == "masks":
-            source = cv2.imread(str(folder / "labels" / Path(name).with_suffix(".png")), cv2.IMREAD_UNCHANGED)
-            expected = warp_mask(torch.from_numpy(np.asarray(source))[None], flow)[0].numpy()
-            assert np.array_equal(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)), expected)
+            source = load_picture(folder / "labels" / Path(name).with_suffix(".png"))
+            expected = warp_mask(torch.from_numpy(source)[None], flow)[0].numpy()
+            assert np.array_equal(load_picture(path), expected)
         else:
             label, *numbers = path.read_text().split()
             x, y, w, h = (float(n) * side for n, side in zip(numbers, [flow.shape[2], 48] * 2, strict=True))
@@ -406,7 +360,7 @@ def test_labels_that_name_no_picture_are_an_error_before_anything_is_written(cal
 
 
 def test_pictures_that_would_share_labels_or_maps_are_an_error(call, folder):
-    write(folder / "raw" / "one" / "b.jpg", picture())
+    save_picture(folder / "raw" / "one" / "b.jpg", smooth_picture())
     message = call("degrade", *WORDS, "maps=true").message
     assert message.startswith("source must hold pictures whose names differ in more than their extension")
     assert message.endswith("got two of one/b")
@@ -414,7 +368,7 @@ def test_pictures_that_would_share_labels_or_maps_are_an_error(call, folder):
 
 
 def test_another_camera_under_the_name_of_the_first_is_not_mixed_with_its_pictures(call, folder):
-    write(folder / "square" / "a.png", picture(64, 64))
+    save_picture(folder / "square" / "a.png", smooth_picture(64, 64))
     words = ("source=square", "out=out", "scene=cape_town_fog", "scene.camera=camera.yaml", "workers=0")
     for focal, code in ((50.0, 0), (50.0, 0), (60.0, 1)):
         camera = Camera(width=64, height=64, fx=focal, fy=focal, cx=31.5, cy=31.5, coefficients=(0.0,) * 4)
@@ -452,10 +406,10 @@ def test_dust_is_thicker_behind_the_vehicles_among_the_labels(call, folder, kind
 @pytest.mark.parametrize("kind", [".flo", ".png"])
 def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tmp_path, kind):
     # The picture moves by 3 px to the right and 1 px up from frame to frame.
-    scene = picture(96, 140, seed=3)
+    scene = smooth_picture(96, 140, seed=3)
     motion = np.broadcast_to(np.array([3, -1], np.float32), (72, 96, 2))
     for i in range(3):
-        write(tmp_path / "raw" / f"{i + 9}.png", scene[10 + i : 82 + i, 20 - 3 * i : 116 - 3 * i])
+        save_picture(tmp_path / "raw" / f"{i + 9}.png", scene[10 + i : 82 + i, 20 - 3 * i : 116 - 3 * i])
         path = tmp_path / "flow" / f"{i + 9}{kind}"
         path.parent.mkdir(exist_ok=True)
         if i < 2:
@@ -464,7 +418,7 @@ def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tm
     words = ("source=raw", "out=out", "scene=paper_refractive", "severity=5", "workers=0", "labels=flow")
     outcome = call("degrade", *words)
     assert (outcome.code, outcome.err) == (0, "")
-    assert written(tmp_path / "out" / "labels") == sorted(f"{i}{kind}" for i in (9, 10))
+    assert files_in(tmp_path / "out" / "labels") == sorted(f"{i}{kind}" for i in (9, 10))
     effect = presets.paper_refractive(5, width=96)
     results = [degraded(tmp_path, f"{i}.png", effect) for i in (9, 10, 11)]
     for i in range(2):
@@ -488,7 +442,7 @@ def test_optical_flow_leads_to_where_the_next_degraded_picture_shows_it(call, tm
 def test_pictures_of_a_drive_are_one_clip_like_a_video(call, tmp_path):
     names = ["one/2.png", "one/10.png", "one/11.png", "two/front/5.png"]  # 10 is after 2
     for i, name in enumerate(names):
-        write(tmp_path / "raw" / name, picture(seed=i))
+        save_picture(tmp_path / "raw" / name, smooth_picture(seed=i))
     words = ("degrade", "source=raw", "scene=cape_town_fog", "severity=4", "workers=0", "seed=3")
     assert call(*words, "out=out", "drive_by=folder").code == 0
     effect = presets.cape_town_fog(4)
@@ -496,19 +450,18 @@ def test_pictures_of_a_drive_are_one_clip_like_a_video(call, tmp_path):
         frames = [read_image(tmp_path / "raw" / name)[None].contiguous() for name in clip]
         params = effect.sample(frames[0], seed=3, keys=[key_of(drive)])
         for t, (name, frame) in enumerate(zip(clip, frames, strict=True)):
-            expected = effect.apply(frame, params, frame=t).image[0].movedim(0, -1).numpy()
-            result = np.asarray(cv2.imread(str(tmp_path / "out" / name)))[..., ::-1]
-            assert np.abs(result / 255 - expected).max() < 0.51 / 255 + 1e-5, name
+            expected = effect.apply(frame, params, frame=t).image[0]
+            assert (read_image(tmp_path / "out" / name) - expected).abs().max() < 0.51 / 255 + 1e-5, name
     complete = {name: (tmp_path / "out" / name).read_bytes() for name in names}
     (tmp_path / "out" / names[1]).unlink()
     assert call(*words, "out=out", "drive_by=folder").code == 0
     assert {name: (tmp_path / "out" / name).read_bytes() for name in names} == complete
     # Another listing would move pictures to other times.
-    write(tmp_path / "raw" / "one" / "4.png", picture())
+    save_picture(tmp_path / "raw" / "one" / "4.png", smooth_picture())
     *_, error = call(*words, "out=out", "drive_by=folder").err.splitlines()
     assert error.startswith("error: out must ")
     assert "drives" in error
-    write(tmp_path / "raw" / "one" / "4.png", picture(width=64))
+    save_picture(tmp_path / "raw" / "one" / "4.png", smooth_picture(width=64))
     outcome = call(*words, "out=more", "drive_by=prefix")
     assert "4.png: pictures of a drive must have the size of its first one, one/2.png, 96x48, got 64x48" in outcome.err
     *_, error = call(*words, "out=none", "drive_by=car").err.splitlines()

@@ -10,11 +10,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 import transformers
+from pictures import save_media, save_picture
+from stores import digests, failing_writes
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -22,6 +23,7 @@ import torchrefract as tr
 from torchrefract._validation import UsageError
 from torchrefract.data.depth_maps import DepthFolder, read_depth, write_depth
 from torchrefract.data.frames import FrameFolder
+from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.module import fingerprint, make_pair
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.data.road_scenes.scene import draw_scene
@@ -32,9 +34,7 @@ from torchrefract.fields.sky import sky_mask
 from torchrefract.types import Frame
 
 # Nobody may reach the hub in a test.
-pytestmark = [
-    pytest.mark.usefixtures("without_hub"),
-]
+pytestmark = pytest.mark.usefixtures("without_hub")
 
 
 @pytest.fixture
@@ -50,43 +50,18 @@ def network(tmp_path_factory) -> Callable[[str], Path]:
     def write(kind: str) -> Path:
         folder = tmp_path_factory.mktemp(kind)
         torch.manual_seed(0)
-        backbone: dict[str, Any] = {
-            "hidden_size": 12,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "image_size": 28,
-            "patch_size": 14,
-            "out_features": ["stage1", "stage2"],
-            "reshape_hidden_states": False,
-        }
-        dino = transformers.Dinov2Config(**backbone)
-        options = {
-            "backbone_config": dino,
-            "reassemble_hidden_size": 12,
-            "patch_size": 14,
-            "reassemble_factors": [2, 1],
-            "neck_hidden_sizes": [8, 8],
-            "fusion_hidden_size": 8,
-            "head_hidden_size": 8,
-        }
+        encoder: dict[str, Any] = {"hidden_size": 12, "num_hidden_layers": 2, "num_attention_heads": 2}
+        encoder |= {"image_size": 28, "patch_size": 14}
         if kind == "dpt":
-            config = transformers.DPTConfig(
-                hidden_size=12,
-                num_hidden_layers=2,
-                num_attention_heads=2,
-                intermediate_size=16,
-                image_size=28,
-                patch_size=14,
-                backbone_out_indices=[0, 0, 1, 1],
-                neck_hidden_sizes=[8, 8, 8, 8],
-                fusion_hidden_size=8,
-            )
-            model = transformers.DPTForDepthEstimation(config)
+            neck = {"backbone_out_indices": [0, 0, 1, 1], "neck_hidden_sizes": [8] * 4, "fusion_hidden_size": 8}
+            model = transformers.DPTForDepthEstimation(transformers.DPTConfig(**encoder, **neck, intermediate_size=16))
         else:
-            metric = {"depth_estimation_type": kind, "max_depth": 80}
-            model = transformers.DepthAnythingForDepthEstimation(
-                transformers.DepthAnythingConfig(**options, **(metric if kind == "metric" else {}))
-            )
+            stages: dict[str, Any] = {"out_features": ["stage1", "stage2"], "reshape_hidden_states": False}
+            options = {"backbone_config": transformers.Dinov2Config(**encoder, **stages), "patch_size": 14}
+            options |= {"reassemble_hidden_size": 12, "reassemble_factors": [2, 1], "neck_hidden_sizes": [8, 8]}
+            options |= {"fusion_hidden_size": 8, "head_hidden_size": 8}
+            options |= {"depth_estimation_type": kind, "max_depth": 80} if kind == "metric" else {}
+            model = transformers.DepthAnythingForDepthEstimation(transformers.DepthAnythingConfig(**options))
         model.save_pretrained(folder)
         size = {"height": 28, "width": 28}
         processor = transformers.DPTImageProcessor(size=size, keep_aspect_ratio=True, ensure_multiple_of=14)
@@ -122,12 +97,9 @@ def roads(count: int, height: int, width: int) -> list[tuple[Tensor, Tensor, Gro
         focal = view.focal * max(height, width)
         right_up, down_up, ahead_up = view.axes[:, 1]
         middle = height / 2 - 0.5 + focal * ahead_up / -down_up
-        road = GroundPlaneDepth(
-            camera_height=float(view.position[1]),
-            focal=focal / width,
-            horizon=float((middle + 0.5) / height),
-            far=math.inf,
-        )
+        horizon = float((middle + 0.5) / height)
+        camera_height = float(view.position[1])
+        road = GroundPlaneDepth(camera_height=camera_height, focal=focal / width, horizon=horizon, far=math.inf)
         assert abs(right_up) < 0.2
         result.append((image, depth, road))
     return result
@@ -187,13 +159,9 @@ def test_a_metric_network_serves_as_the_depth_of_fog(network):
     assert depth.shape == (2, 1, 30, 44)
     assert depth.min() >= 0
     assert depth[depth.isfinite()].max() <= 80
-    fog = tr.UniformFog(depth=provider, visibility_range=(50, 50), deviation_range=(0, 0))
-    expected = tr.UniformFog(visibility_range=(50, 50), deviation_range=(0, 0)).degrade(image, depth=depth, seed=0)
-    assert_close(fog.degrade(image, seed=0).image, expected.image)
-    assert_close(
-        tr.UniformFog(visibility_range=(50, 50), deviation_range=(0, 0)).degrade(image, depth=provider, seed=0).image,
-        expected.image,
-    )
+    expected = tr.UniformFog().degrade(image, depth=depth, seed=0).image
+    assert_close(tr.UniformFog(depth=provider).degrade(image, seed=0).image, expected)
+    assert_close(tr.UniformFog().degrade(image, depth=provider, seed=0).image, expected)
 
 
 def test_the_network_predicts_as_the_library_s_own_pipeline_does(network):
@@ -295,9 +263,7 @@ def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_da
     size = {"dtype": torch.float32, "device": torch.device("cpu")}
     for name in ("clear_road_lidar", "haze_road_lidar"):
         folder = shared_data / "references" / name
-        picture = cv2.imread(str(folder / "image_640x360.jpg"))
-        assert picture is not None
-        image = torch.from_numpy(picture[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
+        image = read_image(folder / "image_640x360.jpg")[None]
         truth = read_depth(folder / "depth_dense_derived_640x360.png")[0][None, None]
         focal = json.loads((folder / "meta.json").read_text())["fx"] / 1920
         road = {"focal": focal, "horizon": 0.55, "spread": 0.1}
@@ -361,11 +327,10 @@ def test_a_frame_by_day_that_shows_no_sky_ends_near_without_a_column():
 
 
 def write_frames(folder: Path) -> list[Path]:
-    (folder / "frames" / "b").mkdir(parents=True)
-    image, _ = render_road_scenes(torch.arange(3), 56, 84)
+    images, _ = render_road_scenes(torch.arange(3), 56, 84)
     paths = [folder / "frames" / name for name in ("a.png", "b/c.jpg", "b/d.png")]
-    for path, picture in zip(paths, image, strict=True):
-        cv2.imwrite(str(path), (picture.permute(1, 2, 0).numpy()[..., ::-1] * 255).round())
+    for path, image in zip(paths, images, strict=True):
+        save_picture(path, pixels_of(image))
     return paths
 
 
@@ -385,9 +350,7 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
         assert message.startswith("error: out must be a folder of the same configuration, got depth, where")
     folder = DepthFolder(tmp_path / "depth")
     depth = folder.read("b/c.jpg", frame_size=(56, 84), size=None)
-    picture = cv2.imread(str(tmp_path / "frames" / "b" / "c.jpg"))
-    assert picture is not None
-    image = torch.from_numpy(picture[..., ::-1].copy()).permute(2, 0, 1)[None].float() / 255
+    image = read_image(tmp_path / "frames" / "b" / "c.jpg")[None].contiguous()
     expected = from_transformers(network("metric"), scale="model")(image)[0]
     assert depth.isinf().equal(expected.isinf())
     assert (depth - expected)[expected.isfinite()].abs().max() <= 1 / 512 + 1e-4
@@ -417,26 +380,18 @@ def test_a_picture_that_changed_after_its_map_was_written_gets_another_one_but_n
     assert "0 depth maps written" in call("estimate_depth", *words).out
 
 
-def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, memory, tmp_path, monkeypatch):
+def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, memory, tmp_path):
     write_frames(tmp_path)
     memory.put(str(tmp_path / "frames"), "/frames", recursive=True)
     words = (f"network={network('metric')}", "scale_by=model", "batch=1")
     stores = ("source=memory://frames", "out=memory://depth")
-    put = memory.put_file
-
-    def stop(source: str, target: str, **more: Any) -> None:
-        if target.endswith("c.png"):
-            raise KeyboardInterrupt
-        put(source, target, **more)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(memory), "put_file", lambda _, *names, **more: stop(*names, **more))
+    with failing_writes(KeyboardInterrupt(), suffix="c.png"):
         assert call("estimate_depth", *words, *stores).code == 130
     assert "memory://depth: 2 depth maps written" in call("estimate_depth", *words, *stores).out
     assert "memory://depth: 0 depth maps written" in call("estimate_depth", *words, *stores).out
     assert call("estimate_depth", *words, "source=frames", "out=depth").code == 0
-    for path in (tmp_path / "depth").rglob("*.png"):
-        assert memory.cat_file(f"/depth/{path.relative_to(tmp_path / 'depth').as_posix()}") == path.read_bytes()
+    on_disk, in_store = digests(tmp_path / "depth"), digests("memory://depth")
+    assert all(on_disk[name] == data for name, data in in_store.items() if name.endswith(".png"))
 
     options = ("scene=cape_town_fog", "source=frames", "workers=0")
     for command, more in (("degrade", ()), ("generate", ("license=CC0",))):
@@ -446,12 +401,11 @@ def test_maps_in_a_store_are_those_on_disk_and_serve_as_depth(call, network, mem
         first, second = ({p.name: p.read_bytes() for p in (tmp_path / f"{command}{k}").rglob("*.*g")} for k in (1, 2))
         assert first == second
         assert first
-    frames = [
-        FrameFolder(root, size=(28, 42), depth=depth)
-        for root, depth in (("frames", "depth"), ("memory://frames", "memory://depth"))
-    ]
-    for one, other in zip(*frames, strict=True):
-        assert one.depth.equal(other.depth)
+    on_disk, in_store = (
+        FrameFolder(f"{root}frames", size=(28, 42), depth=f"{root}depth") for root in ("", "memory://")
+    )
+    assert len(on_disk) == len(in_store)
+    assert all(on_disk[i].depth.equal(in_store[i].depth) for i in range(len(on_disk)))
     memory.rm("/depth/a.png")
     message = call("generate", *options, "license=CC0", "depth=memory://depth", "out=other").message
     assert message.startswith("depth must be a folder with a map for each frame, got none for a.png in memory://depth")
@@ -527,10 +481,7 @@ def test_a_missing_library_is_named(call, tmp_path, monkeypatch):
 
 def test_the_frames_of_videos_have_maps_by_their_numbers(call, network, tmp_path):
     (tmp_path / "drives").mkdir()
-    writer = cv2.VideoWriter(str(tmp_path / "drives" / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (84, 56))
-    for k in range(3):
-        writer.write(np.full((56, 84, 3), 40 * k, np.uint8))
-    writer.release()
+    save_media(tmp_path / "drives" / "a.mp4", [np.full((56, 84, 3), 40 * k, np.uint8) for k in range(3)])
     words = ("source=drives", "out=depth", f"network={network('metric')}", "scale_by=model")
     assert call("estimate_depth", *words).code == 0
     assert sorted(path.name for path in (tmp_path / "depth" / "a.mp4").iterdir()) == [f"{k:06d}.png" for k in range(3)]

@@ -1,9 +1,9 @@
 import math
 import re
 
-import cv2
 import numpy as np
 import pytest
+from pictures import save_picture
 
 from torchrefract import LensDistortion
 from torchrefract.cameras.io import read_camera, read_covariance
@@ -16,9 +16,8 @@ BARREL = (-0.16, 0.06)  # relative to the half diagonal
 @pytest.fixture
 def folder(tmp_path, drive):
     """Write six frames of straight edges through a barrel lens into raw/ and return the working folder."""
-    (tmp_path / "raw").mkdir()
     for i, frame in enumerate(drive(BARREL, 6)):
-        cv2.imwrite(str(tmp_path / "raw" / f"{i}.png"), pixels_of(frame)[..., ::-1])
+        save_picture(tmp_path / "raw" / f"{i}.png", pixels_of(frame))
     return tmp_path
 
 
@@ -112,7 +111,7 @@ def test_an_invalid_option_is_one_line_of_error_before_frames_are_read(call, fol
 def test_pictures_of_two_sizes_and_a_checkpoint_of_another_task_are_errors(call, folder, brighter):
     message = call("estimate_lens", "input=raw", f"checkpoint={brighter}").message
     assert message.startswith("checkpoint must be of the task undistort, got ")
-    cv2.imwrite(str(folder / "raw" / "9.png"), np.zeros((40, 60, 3), np.uint8))
+    save_picture(folder / "raw" / "9.png", np.zeros((40, 60, 3), np.uint8))
     message = call("estimate_lens", "input=raw").message
     assert message.startswith("input: frames must be of one size, since they are of one camera, got 480 x 270 px and")
     assert message.endswith("in raw/9.png, 60 x 40 px")

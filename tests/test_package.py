@@ -18,27 +18,9 @@ from torchrefract._tensor import assume_constant_result
 from torchrefract.effects.base import Effect
 
 ROOT = Path(__file__).parents[1]
-HEAVY = (
-    "PIL",
-    "albumentations",
-    "av",
-    "cv2",
-    "diffusers",
-    "hydra",
-    "kornia",
-    "lightning",
-    "matplotlib",
-    "omegaconf",
-    "pytorch_lightning",
-    "rich",
-    "scipy",
-    "segmentation_models_pytorch",
-    "timm",
-    "torch._dynamo",
-    "torchvision",
-    "yaml",
-)
 LEARNING = ("diffusers", "pytorch_lightning", "segmentation_models_pytorch", "timm", "torch._dynamo", "torchvision")
+HEAVY = (*LEARNING, "PIL", "albumentations", "av", "cv2", "hydra", "kornia", "lightning", "matplotlib", "omegaconf")
+HEAVY += ("rich", "scipy", "yaml")
 LISTED = "import {modules}; print([name for name in {names} if name in sys.modules])"
 # Run commands with a finder that misses the libraries of a list, and print the exit code of each.
 WITHOUT = """

@@ -11,25 +11,8 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from torchrefract import (
-    Compose,
-    DivergenceFree,
-    GroundPlaneDepth,
-    HeterogeneousFog,
-    LensDistortion,
-    LensFlare,
-    NightGlow,
-    OneOf,
-    PhysicalTurbulence,
-    RoadMirage,
-    RollingShutter,
-    SunGlare,
-    ThinPlateSpline,
-    Turbulence,
-    TurbulenceBlur,
-    UniformFog,
-    presets,
-)
+import torchrefract as tr
+from torchrefract import presets
 from torchrefract.cameras.brown_conrady import distort_with_jacobian
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.base import Effect
@@ -42,15 +25,15 @@ SCENES: dict[str, Callable[..., Any]] = {
     if not name.startswith("_") and function.__module__ == presets.__name__
 }
 EFFECTS = {
-    "cheap_dashcam": {LensDistortion},
-    "cape_town_fog": {HeterogeneousFog},
-    "night_fog": {HeterogeneousFog, NightGlow},
-    "limpopo_sun_glare": {SunGlare},
-    "highveld_heat_haze": {RoadMirage, Turbulence},
-    "highveld_telephoto": {PhysicalTurbulence, TurbulenceBlur},
-    "unpaved_road": {HeterogeneousFog, Turbulence, RollingShutter},
-    "paper_refractive": {LensDistortion, Turbulence, ThinPlateSpline, DivergenceFree},
-    "paper_weather": {UniformFog, HeterogeneousFog, LensFlare},
+    "cheap_dashcam": {tr.LensDistortion},
+    "cape_town_fog": {tr.HeterogeneousFog},
+    "night_fog": {tr.HeterogeneousFog, tr.NightGlow},
+    "limpopo_sun_glare": {tr.SunGlare},
+    "highveld_heat_haze": {tr.RoadMirage, tr.Turbulence},
+    "highveld_telephoto": {tr.PhysicalTurbulence, tr.TurbulenceBlur},
+    "unpaved_road": {tr.HeterogeneousFog, tr.Turbulence, tr.RollingShutter},
+    "paper_refractive": {tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree},
+    "paper_weather": {tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare},
 }
 
 # Arguments of each effect of a scene that is not the paper's.
@@ -69,7 +52,7 @@ _PINHOLE = {"width": 640, "height": 360, "fx": 500.0, "fy": 510.0, "cx": 326.5, 
 PLACE: dict[str, Any] = {
     "camera": Camera(**_PINHOLE, coefficients=(0.0,) * 4, model="opencv"),
     "horizon": 0.4,
-    "depth": GroundPlaneDepth(),
+    "depth": tr.GroundPlaneDepth(),
     "width": 640,
 }
 
@@ -86,7 +69,7 @@ def scene_for_size(name: str, severity: int = 3) -> Effect:
 
 
 def leaves(effect: Effect) -> Iterator[Any]:
-    if isinstance(effect, Compose):
+    if isinstance(effect, tr.Compose):
         for child in effect.effects:
             yield from leaves(child)  # pyright: ignore[reportArgumentType]  # effects hold effects
     else:
@@ -166,7 +149,7 @@ def test_a_camera_that_meters_fog_by_day_darkens_it_and_leaves_the_night():
     white[:, :, 40:] = 0.3
     night[:, :, 20:24, 40:44] = 0.6
     for frame, is_darker in ((white, True), (night, False)):
-        scene: Any = presets.cape_town_fog(5, depth=GroundPlaneDepth(), exposure=True)
+        scene: Any = presets.cape_town_fog(5, depth=tr.GroundPlaneDepth(), exposure=True)
         params = scene.sample(frame, seed=1)
         foggy = scene.effects[0].apply(frame, params.children[0]).image
         exposed = scene.apply(frame, params).image
@@ -200,7 +183,7 @@ def test_lamps_shine_through_fog_at_night_in_a_glow():
 
 def test_severities_of_heat_haze_have_the_documented_cn2():
     for severity, cn2 in zip(presets.SEVERITIES, (7.6e-11, 3e-10, 6.8e-10, 1.5e-9, 2.7e-9), strict=True):
-        (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, Turbulence))
+        (haze,) = (e for e in SCENES["highveld_heat_haze"](severity).effects if isinstance(e, tr.Turbulence))
         low, high = (math.sqrt(value) for value in haze.equivalent_cn2(width=1920, distance=200.0))
         assert ((low + high) / 2) ** 2 == pytest.approx(cn2, rel=0.03)
 
@@ -223,7 +206,7 @@ def test_displacements_scale_with_the_width(name):
     wide, narrow = (SCENES[name](3, width=width) for width in (1920, 480))
     for first, second in zip(leaves(wide), leaves(narrow), strict=True):
         for option in ("amplitude_range", "length_range", "aperture_range"):
-            if hasattr(first, option) and not isinstance(first, HeterogeneousFog):
+            if hasattr(first, option) and not isinstance(first, tr.HeterogeneousFog):
                 assert getattr(first, option) == pytest.approx([4 * value for value in getattr(second, option)])
     with pytest.raises(ValueError, match="width must be above 0, got 0"):
         SCENES[name](3, width=0)
@@ -232,7 +215,7 @@ def test_displacements_scale_with_the_width(name):
 @pytest.mark.parametrize("name", ["paper_refractive", "paper_weather"])
 def test_one_of_the_paper_s_effects_is_applied_to_each_sample(name):
     effect = scene_for_size(name)
-    assert isinstance(effect, OneOf)
+    assert isinstance(effect, tr.OneOf)
     params = effect.sample(torch.zeros(200, 3, *SIZE), seed=1)
     applied = torch.stack([child.applied for child in params.children])
     assert (applied.sum(dim=0) == 1).all()
@@ -251,7 +234,7 @@ def test_camera_horizon_depth_width_and_other_arguments_reach_each_effect(name):
         assert leaf.p == 0.25
         view = getattr(leaf, "medium", leaf)
         assert getattr(view, "camera", camera) == camera
-        assert view.depth is (None if isinstance(leaf, LensDistortion | SunGlare | NightGlow) else depth)
+        assert view.depth is (None if isinstance(leaf, tr.LensDistortion | tr.SunGlare | tr.NightGlow) else depth)
         assert getattr(leaf, "horizon", 0.4) == 0.4
         assert getattr(leaf, "focal", 500 / 640) == 500 / 640
     with pytest.raises(TypeError, match="mistyped"):

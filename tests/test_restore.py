@@ -2,10 +2,10 @@ import json
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import files_in, load_clip, save_clip, save_picture, smooth_picture
 from PIL import Image
 
 from torchrefract import warp
@@ -18,29 +18,12 @@ from torchrefract.fields.rectification import camera_flow
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
 
 
-def picture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    """Return (H, W, 3), uint8, smooth enough for a video codec."""
-    y, x = np.mgrid[:height, :width]
-    return np.stack([127 + 100 * np.sin(x / (9 + c) + seed) * np.cos(y / (11 - c)) for c in range(3)], -1).astype(
-        np.uint8
-    )
-
-
-def write(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), pixels)
-
-
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """Write pictures of several sizes into raw/ and return the working folder."""
     for i, (name, size) in enumerate(SIZES.items()):
-        write(tmp_path / "raw" / name, picture(*size, seed=i))
+        save_picture(tmp_path / "raw" / name, smooth_picture(*size, seed=i))
     return tmp_path
-
-
-def written(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 def rate(outcome) -> float:
@@ -50,13 +33,20 @@ def rate(outcome) -> float:
     return float(words[2])
 
 
+def printed_deviation(outcome) -> float:
+    """Return the standard deviation of the flow that a command prints, px."""
+    deviation = re.search(r"^standard deviation of the flow: (\d+\.\d) px", outcome.out, re.MULTILINE)
+    assert deviation
+    return float(deviation[1])
+
+
 @pytest.mark.parametrize("interpolation", ["bicubic", "bilinear"])
 def test_pictures_keep_their_names_and_sizes_and_are_warped_along_the_flow(call, folder, shifted, interpolation):
     outcome = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", f"interpolation={interpolation}")
     assert outcome.out.splitlines()[0] == "out: 4 restored, 0 already existed, 0 skipped"
     assert rate(outcome) > 0
     assert outcome.err == ""
-    assert written(folder / "out") == sorted([*SIZES, "config.json"])
+    assert files_in(folder / "out") == sorted([*SIZES, "config.json"])
     for name, (height, width) in SIZES.items():
         flow = torch.tensor([width / 16, -height / 32]).view(1, 2, 1, 1).expand(1, 2, height, width)
         image = read_image(folder / "raw" / name)[None].contiguous()
@@ -67,21 +57,19 @@ def test_pictures_keep_their_names_and_sizes_and_are_warped_along_the_flow(call,
 
 def test_the_standard_deviation_of_a_flow_is_printed_in_px_of_the_frames(call, folder, undecided):
     outcome = call("restore", f"ckpt_path={undecided}", "input=raw/a.png", "out=out")
-    deviation = re.search(r"^standard deviation of the flow: (\d+\.\d) px", outcome.out, re.MULTILINE)
-    assert deviation
-    assert float(deviation[1]) == pytest.approx(96 / 20, rel=0.2)  # of 64 samples
+    assert printed_deviation(outcome) == pytest.approx(96 / 20, rel=0.2)  # of 64 samples
 
 
 def test_maps_of_the_standard_deviation_lie_beside_the_pictures_of_a_model_that_samples(call, folder, undecided):
     words = (f"ckpt_path={undecided}", "input=raw", "out=out")
     outcomes = [call("restore", *words)]
     assert outcomes[0].code == 0
-    assert written(folder / "out") == sorted([*SIZES, "config.json"])
+    assert files_in(folder / "out") == sorted([*SIZES, "config.json"])
     plain = {name: (folder / "out" / name).read_bytes() for name in SIZES}
     outcomes.append(call("restore", *words, "deviation=true"))  # adds them to a folder without
     assert outcomes[1].out.splitlines()[0] == "out: 4 restored, 0 already existed, 0 skipped"
     maps = {name: name.rsplit(".", 1)[0] + ".deviation.png" for name in SIZES}
-    assert written(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
+    assert files_in(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
     assert {name: (folder / "out" / name).read_bytes() for name in SIZES} == plain
     levels = {name: np.array(Image.open(folder / "out" / maps[name])) for name in SIZES}
     for name, size in SIZES.items():
@@ -90,25 +78,21 @@ def test_maps_of_the_standard_deviation_lie_beside_the_pictures_of_a_model_that_
         assert levels[name][0, 0] / 256 == pytest.approx(size[1] / 20, rel=0.3)  # of 64 samples
     median = np.median([value[0, 0] / 256 for value in levels.values()])
     for outcome in outcomes:
-        deviation = re.search(r"^standard deviation of the flow: (\d+\.\d) px", outcome.out, re.MULTILINE)
-        assert deviation
-        assert float(deviation[1]) == pytest.approx(median, abs=0.06)
+        assert printed_deviation(outcome) == pytest.approx(median, abs=0.06)
     (folder / "out" / maps["one/b.png"]).unlink()
     assert "1 restored, 3 already existed" in call("restore", *words, "deviation=true").out
-    assert written(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
+    assert files_in(folder / "out") == sorted([*SIZES, *maps.values(), "config.json"])
 
 
 def test_maps_of_the_standard_deviation_that_cannot_be_written_are_one_line_of_error(
     call, folder, undecided, shifted, brighter
 ):
     (folder / "clip").mkdir()
-    clip(folder / "clip" / "a.avi", 2)
+    save_clip(folder / "clip" / "a.avi", [smooth_picture(64)] * 2)
     for name in ("a.png", "a.bmp"):
-        write(folder / "twice" / name, picture(8, 8))
+        save_picture(folder / "twice" / name, smooth_picture(8, 8))
     single = f"ckpt_path={undecided}", "+model.samples=1"
-    rule = (
-        "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at least "
-    )
+    rule = "deviation must be false for pool=lens, whose deviation is printed, and for any model but ddpm with at least"
     for words, message in (
         ((f"ckpt_path={shifted}", "input=raw"), rule),
         ((f"ckpt_path={brighter}", "input=raw"), rule),
@@ -125,7 +109,7 @@ def test_maps_of_the_standard_deviation_that_cannot_be_written_are_one_line_of_e
 
 def test_pooled_frames_of_a_camera_are_restored_along_one_flow(call, tmp_path, drive, shifted):
     for i, frame in enumerate(drive((-0.16, 0.06), 6)):
-        write(tmp_path / "raw" / f"{i}.png", pixels_of(frame)[..., ::-1])
+        save_picture(tmp_path / "raw" / f"{i}.png", pixels_of(frame))
     outcome = call("restore", f"ckpt_path={shifted}", "input=raw", "out=out", "pool=lens")
     assert re.search(r"out/camera.yaml: k1 -0\.\d+ .* from 6 frames", outcome.out)
     flow = camera_flow(read_camera(tmp_path / "out" / "camera.yaml"))[0]
@@ -141,12 +125,12 @@ def test_each_video_is_restored_along_one_lens_by_a_model_that_finds_lenses(call
     frames = [pixels_of(frame) for frame in drive((-0.16, 0.06), 6)]
     (tmp_path / "raw").mkdir()
     write_video(frames, tmp_path / "raw" / "a.mp4", fps=10, size=(480, 270))
-    write(tmp_path / "raw" / "b.png", frames[0])
+    save_picture(tmp_path / "raw" / "b.png", frames[0])
     (tmp_path / "raw" / "damaged.mp4").write_bytes(b"no video")
     outcome = call("restore", "ckpt_path=lens_small", "input=raw", "out=out")
     assert outcome.out.splitlines()[0].startswith("out/a.camera.yaml: k1 -0.")
     assert "out: 2 restored, 0 already existed, 1 skipped" in outcome.out
-    assert written(tmp_path / "out") == ["a.camera.yaml", "a.mp4", "b.png", "config.json"]
+    assert files_in(tmp_path / "out") == ["a.camera.yaml", "a.mp4", "b.png", "config.json"]
     flow = camera_flow(read_camera(tmp_path / "out" / "a.camera.yaml"))[0]
     assert flow.abs().max() > 3
     before, after = (dict(read_video(tmp_path / name / "a.mp4", range(6))) for name in ("raw", "out"))
@@ -154,7 +138,7 @@ def test_each_video_is_restored_along_one_lens_by_a_model_that_finds_lenses(call
         expected = warp(image, flow, padding="border", interpolation="bicubic")[0].clamp(0, 1)
         assert (after[i] - expected).abs().mean() < 0.01  # of the codec
     assert call("restore", "ckpt_path=lens_small", "input=raw", "out=alone", "pool=null").code == 0
-    assert written(tmp_path / "alone") == ["a.mp4", "b.png", "config.json"]
+    assert files_in(tmp_path / "alone") == ["a.mp4", "b.png", "config.json"]
 
 
 @pytest.mark.parametrize("tile", ["null", "[20,40]"])
@@ -207,7 +191,7 @@ def test_a_folder_of_other_settings_is_not_continued(call, folder, brighter, shi
 
 
 def test_a_folder_of_other_files_is_left_alone(call, folder, brighter):
-    write(folder / "out" / "a.png", picture(48, 96))
+    save_picture(folder / "out" / "a.png", smooth_picture(48, 96))
     before = (folder / "out" / "a.png").read_bytes()
     message = call("restore", f"ckpt_path={brighter}", "input=raw", "out=out").message
     assert message.startswith("out must be a new folder or one of this command, got out, which holds a.png")
@@ -220,12 +204,12 @@ def test_a_damaged_picture_is_reported_and_skipped(call, folder, brighter):
     outcome = call("restore", f"ckpt_path={brighter}", "input=raw", "out=out", "batch=1")
     assert outcome.out.startswith("out: 3 restored, 0 already existed, 1 skipped")
     assert outcome.err.startswith("skipped: raw/one/b.png is truncated")
-    assert written(folder / "out") == sorted({*SIZES, "config.json"} - {"one/b.png"})
+    assert files_in(folder / "out") == sorted({*SIZES, "config.json"} - {"one/b.png"})
 
 
 @pytest.mark.parametrize("name", ["one/b.png", "one/clip.avi"])
 def test_a_file_that_vanishes_during_a_run_is_named_and_restored_by_the_next(call, folder, brighter, monkeypatch, name):
-    clip(folder / "raw" / "one" / "clip.avi", 3)
+    save_clip(folder / "raw" / "one" / "clip.avi", [smooth_picture(64)] * 3)
     file, away, words = folder / "raw" / name, folder / "away", (f"ckpt_path={brighter}", "input=raw", "out=out")
     with monkeypatch.context() as patch:
         patch.setattr("torchrefract.cli.restoration.describe_losses", lambda *_, **__: [file.rename(away)][1:])
@@ -241,24 +225,15 @@ def test_a_file_that_vanishes_during_a_run_is_named_and_restored_by_the_next(cal
     assert call("restore", *words).out.startswith("out: 1 restored, 4 already existed, 0 skipped")
 
 
-def clip(path: Path, count: int, *, height: int = 64) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 12, (96, height))
-    for k in range(count):
-        writer.write(picture(height, 96, seed=k)[..., ::-1])
-    writer.release()
-
-
 def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
-    clip(folder / "raw" / "one" / "clip.avi", 5)
+    frames = [smooth_picture(64, seed=k) for k in range(5)]
+    save_clip(folder / "raw" / "one" / "clip.avi", frames)
     words = (f"ckpt_path={brighter}", "input=raw", "out=out", "batch=2", "side_by_side=true")
     outcome = call("restore", *words)
     assert outcome.out.startswith("out: 5 restored")
     assert outcome.out.splitlines()[1].startswith("9 frames, ")
     assert video_info(folder / "out" / "one" / "clip.mp4") == (5, 12.0)
-    capture = cv2.VideoCapture(str(folder / "out" / "one" / "clip.mp4"))
-    for k in range(5):
-        frame = np.asarray(capture.read()[1])[..., ::-1].astype(float)
-        raw = picture(64, 96, seed=k)
+    for raw, frame in zip(frames, load_clip(folder / "out" / "one" / "clip.mp4"), strict=True):
         expected = np.concatenate([raw, (raw + np.array([51, 0, -25.5])).clip(0, 255)], axis=1)
         assert np.abs(frame - expected).mean() < 8  # two lossy codecs
     assert "0 restored, 5 already existed" in call("restore", *words).out
@@ -267,7 +242,7 @@ def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
 def test_a_video_that_is_skipped_is_closed_at_once(call, tmp_path, brighter, monkeypatch):
     """An error that is kept with its traceback keeps frames, open files and the thread that prints the progress."""
     (tmp_path / "raw").mkdir()
-    Image.fromarray(picture(33, 65)).save(tmp_path / "raw" / "a.gif")
+    Image.fromarray(smooth_picture(33, 65)).save(tmp_path / "raw" / "a.gif")
     skip, tracebacks = restoration._skip, list[object]()
 
     def noted(file, error, failed):
@@ -280,14 +255,14 @@ def test_a_video_that_is_skipped_is_closed_at_once(call, tmp_path, brighter, mon
 
 
 def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):
-    pages = [Image.fromarray(picture(63, 96, seed=k)) for k in range(2)]
+    pages = [Image.fromarray(smooth_picture(63, 96, seed=k)) for k in range(2)]
     pages[0].save(tmp_path / "clip.gif", save_all=True, append_images=pages[1:])
     outcome = call("restore", f"ckpt_path={brighter}", "input=clip.gif", "out=out")
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1].startswith("error: input must hold a file that can be restored, got ")
     assert "clip.gif would give frames of 96 x 63, and videos take even sides only; crop it first: " in outcome.err
     assert outcome.err.endswith('ffmpeg -i INPUT -vf "crop=trunc(iw/2)*2:trunc(ih/2)*2" OUTPUT\n')
-    assert written(tmp_path / "out") == ["config.json"]
+    assert files_in(tmp_path / "out") == ["config.json"]
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,7 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +11,9 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from pictures import save_picture
 from PIL import Image
+from processes import running, wait_for
 from torch.utils.data import DataLoader
 
 from torchrefract import presets
@@ -24,15 +23,12 @@ from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error, psnr
 from torchrefract.restoration.module import Restoration
+from torchrefract.restoration.report import metrics_rows
 
 pytestmark = pytest.mark.usefixtures("blank_figures")  # `trained`, a process of its own, draws them
 FILES = ["best.ckpt", "config.yaml", "curves.png", "last.ckpt", "metrics.csv", "panel.png"]
-DDPM = (
-    "model=ddpm_image",
-    "model.network.widths=[8,16]",
-    "model.network.attention=[false,true]",
-    "model.network.layers=1",
-)
+DDPM = ("model=ddpm_image", "model.network.widths=[8,16]", "model.network.attention=[false,true]")
+DDPM += ("model.network.layers=1",)
 DDPM += ("model.network.groups=4", "model.val_steps=3", "model.lr=0.002", "data.train_count=8", "data.val_count=4")
 DDPM += ("data.batch_size=4", "data.size=[16,32]", "data.workers=0")
 
@@ -183,24 +179,13 @@ def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatc
     assert message.startswith("trainer must be ddp with trainer.devices=1 and trainer.num_nodes=2 under torchrun, got")
 
 
-def wait_for_checkpoint(path: Path, is_running: Callable[[], bool]) -> None:
-    end = time.monotonic() + 200
-    while not path.exists() and is_running() and time.monotonic() < end:
-        time.sleep(0.05)
-
-
 def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(small, tmp_path):
     path = tmp_path / "run" / "last.ckpt"
     words = ("+task=undistort", *small, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "run_dir=run")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "torchrefract.train", *words, "trainer.max_epochs=1000"]
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            wait_for_checkpoint(path, lambda: process.poll() is None)
-            process.terminate()
-            _, message = process.communicate(timeout=60)
-        finally:
-            process.kill()
+    with running("-m", "torchrefract.train", *words, "trainer.max_epochs=1000", cwd=tmp_path) as process:
+        wait_for(path.exists, process)
+        process.terminate()
+        _, message = process.communicate(timeout=60)
     assert process.returncode == 143, message
     (line,) = (line for line in message.splitlines() if line.startswith("stopped by SIGTERM"))
     assert line.endswith("ckpt_path=run/last.ckpt continues")
@@ -210,16 +195,10 @@ def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(s
 def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):
     # Not forked from the tests: a forked process could wait forever for threads of its parent.
     words = ("+task=undistort", *small, "run_dir=run", "trainer.max_epochs=1000", "data.workers=1")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    options = {"cwd": tmp_path, "env": environment, "stderr": subprocess.PIPE, "text": True}
-    command = [sys.executable, "-m", "torchrefract.train", *words]
-    with subprocess.Popen(command, start_new_session=True, **options) as process:
-        try:
-            wait_for_checkpoint(tmp_path / "run" / "last.ckpt", lambda: process.poll() is None)
-            os.killpg(process.pid, signal.SIGTERM)  # as SLURM and systemd send it
-            _, message = process.communicate(timeout=60)
-        finally:
-            process.kill()
+    with running("-m", "torchrefract.train", *words, cwd=tmp_path) as process:
+        wait_for((tmp_path / "run" / "last.ckpt").exists, process)
+        os.killpg(process.pid, signal.SIGTERM)  # as SLURM and systemd send it
+        _, message = process.communicate(timeout=60)
     assert process.returncode == 143, message
     (line,) = (line for line in message.splitlines() if "stopped" in line or "Error" in line)
     assert re.fullmatch(r"stopped by SIGTERM in step \d+; ckpt_path=run/last.ckpt continues", line)
@@ -313,10 +292,7 @@ def test_initial_weights_of_another_model_are_one_line_of_error(call, small, wor
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            ("scene=cape_town_fog",),
-            "data: effect must have a flow, as a lens has, got HeterogeneousFog",
-        ),
+        (("scene=cape_town_fog",), "data: effect must have a flow, as a lens has, got HeterogeneousFog"),
         (
             ("scene=paper_refractive", "data.border=black"),
             "data: border must be null unless the scene is a lens that fills its frames, got black",
@@ -374,11 +350,9 @@ def test_a_logger_without_its_package_names_the_extra(call, small, monkeypatch):
 
 
 def test_a_damaged_pair_is_one_line_of_error(call, small, tmp_path):
-    (tmp_path / "frames").mkdir()
-    for drive in "ab":
-        for i in range(4):
-            pixels = np.random.default_rng(i).integers(0, 256, (36, 48, 3), dtype=np.uint8)
-            Image.fromarray(pixels).save(tmp_path / "frames" / f"{drive}_{i}.png")
+    for drive, i in product("ab", range(4)):
+        pixels = np.random.default_rng(i).integers(0, 256, (36, 48, 3), dtype=np.uint8)
+        save_picture(tmp_path / "frames" / f"{drive}_{i}.png", pixels)
     words = ("scene=cheap_dashcam", "source=frames", "out=out", "license=CC0", "workers=0")
     assert call("generate", *words).code == 0
     stored = PairedFolder(tmp_path / "out", split="train")
@@ -398,15 +372,11 @@ def test_deweathering_trains_by_the_same_command_into_a_new_folder(call, small, 
     head, nothing, fog, model, _, verdict = outcome.out.splitlines()[-6:]
     assert "endpoint" not in head
     assert (nothing[:10], fog[:8], model[:5]) == ("do nothing", "true fog", "model")
-    gain = (
-        max(metrics(tmp_path / "new" / "run", "val/psnr").values())
-        - metrics(tmp_path / "new" / "run", "val/psnr_identity")[0]
-    )
-    assert (
-        f"than doing nothing by {gain:.2f} dB" in verdict
-        or f"NOT better than doing nothing ({gain:+.2f} dB)" in verdict
-    )
-    assert read_checkpoint(tmp_path / "new" / "run" / "last.ckpt", task="deweather")["epoch"] == 0
+    run = tmp_path / "new" / "run"
+    gain = max(metrics(run, "val/psnr").values()) - metrics(run, "val/psnr_identity")[0]
+    better, worse = f"than doing nothing by {gain:.2f} dB", f"NOT better than doing nothing ({gain:+.2f} dB)"
+    assert better in verdict or worse in verdict
+    assert read_checkpoint(run / "last.ckpt", task="deweather")["epoch"] == 0
 
 
 def model_line(text: str) -> list[str]:
@@ -495,14 +465,11 @@ def test_an_evaluation_repeats_the_scores_of_the_training_and_leaves_its_folder_
     assert OmegaConf.select(OmegaConf.load(folder / "config.yaml"), "ckpt_path") == str(checkpoint)
     assert {path: path.stat().st_mtime_ns for path in trained.folder.iterdir()} == before
     best = read_checkpoint(checkpoint, task="undistort")["epoch"]
-    with (trained.folder / "metrics.csv").open(newline="") as file:
-        expected = next(row for row in csv.DictReader(file) if row["epoch"] == str(best) and row["val/loss"])
-    with (folder / "metrics.csv").open(newline="") as file:
-        (scores,) = csv.DictReader(file)
-    names = [name for name in expected if name.startswith("val/")]
-    assert {"val/psnr", "val/epe", "val/epe_constant", "val/ssim_identity"} <= set(names)
+    (scores,) = metrics_rows(folder)
+    names = {name for row in metrics_rows(trained.folder) for name in row if name.startswith("val/")}
+    assert {"val/psnr", "val/epe", "val/epe_constant", "val/ssim_identity"} <= names
     for name in names:
-        assert float(scores[name]) == pytest.approx(float(expected[name]), rel=1e-4), name
+        assert float(scores[name]) == pytest.approx(metrics(trained.folder, name)[best], rel=1e-4), name
 
 
 def test_an_evaluation_needs_a_checkpoint_of_its_task(call, trained, small):

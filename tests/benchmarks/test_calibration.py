@@ -1,5 +1,4 @@
 import json
-import sys
 from dataclasses import replace
 
 import calibration
@@ -20,7 +19,7 @@ def table_row(name: str, camera: Camera, model: str, licence: str) -> dict:
     return {"id": name, "model": model, "coeffs": camera.coefficients, "licence": licence} | numbers | source
 
 
-def test_errors_of_lenses_are_measured_and_the_table_is_written(monkeypatch, tmp_path, capsys):
+def test_errors_of_lenses_are_measured_and_the_table_is_written(monkeypatch, tmp_path, run_program):
     # A ray of a pixel 1 px off has an error of 1 px.
     pixels = WEBCAM.grid(4)
     rays = WEBCAM.unproject(pixels + pixels.new_tensor([0.6, 0.8])).points
@@ -36,9 +35,7 @@ def test_errors_of_lenses_are_measured_and_the_table_is_written(monkeypatch, tmp
     (tmp_path / "lenses.json").write_text(json.dumps(rows))
     options = ["lenses", "lenses.json", "--step", "16", "--out", "run.json", "--table", "lenses.csv"]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["calibration.py", *options])
-    calibration.main()
-    assert "not marked: ours 0 and OpenCV 2 of 3, kornia 2 of 2" in capsys.readouterr().out
+    assert "not marked: ours 0 and OpenCV 2 of 3, kornia 2 of 2" in run_program(calibration, *options)
     results = json.loads((tmp_path / "run.json").read_text())
     assert [(row["name"], row["ours_wrong"], row["invalid"]) for row in results] == [(row["id"], 0, 0) for row in rows]
     lenses = read_lenses(tmp_path / "lenses.csv")

@@ -35,21 +35,17 @@ def test_rows_above_their_limit_are_marked():
     ]
 
 
-def test_the_command_times_each_backend_or_counts_calls(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+def test_the_command_times_each_backend_or_counts_calls(monkeypatch, tmp_path, run_program):
     monkeypatch.setattr(effects, "WARPS", {"mild lens": timing.WARPS["mild lens"]})
     monkeypatch.setattr(effects, "OTHER_WARPS", {})
     monkeypatch.setattr(effects, "PHOTOMETRIC", {"flare": LensFlare})
     monkeypatch.setattr(effects, "all_warps", LensDistortion)
     out = tmp_path / "effects.json"
-    monkeypatch.setattr(sys, "argv", ["effects.py", "--size", "24x40", "--threads", "1", "--out", str(out)])
-    effects.main()
-    assert "bar <= 0.9 x bare grid_sample" in capsys.readouterr().out
+    printed = run_program(effects, "--size", "24x40", "--threads", "1", "--out", out)
+    assert "bar <= 0.9 x bare grid_sample" in printed
     names = {row["name"] for row in json.loads(out.read_text())["timings"]}
     assert {"mild lens, within 0.05 px", "mild lens, exact, torch", "all four warps, exact", "flare"} <= names
     monkeypatch.setattr(effects, "CALL_SIZE", (24, 40))
-    monkeypatch.setattr(sys, "argv", ["effects.py", "--calls", "--verbose"])
-    effects.main()
-    lines = capsys.readouterr().out.splitlines()
+    lines = run_program(effects, "--calls", "--verbose").splitlines()
     assert sum(line.startswith("composition of four warps and fog, warm: ") for line in lines) == 3
     assert len(lines) == 4 * (3 + effects.NUM_FUNCTIONS)

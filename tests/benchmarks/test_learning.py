@@ -11,11 +11,9 @@ pytestmark = pytest.mark.filterwarnings(  # of Lightning: a training of seconds 
 @pytest.mark.parametrize(
     ("task", "names", "seconds"), [("undistort", ["ddpm", "lens_net"], 1), ("deweather", ["fog_net"], 3)]
 )
-def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeypatch, capsys, task, names, seconds):
-    words = ["learning.py", "--task", task, "--models", *names, "--seconds", str(seconds), "--size", "32x56"]
-    monkeypatch.setattr("sys.argv", [*words, "--scenes", "16", "--val", "2", "--out", str(tmp_path)])
-    learning.main()
-    first = capsys.readouterr().out
+def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, run_program, task, names, seconds):
+    words = ["--task", task, "--models", *names, "--seconds", seconds, "--size", "32x56", "--scenes", "16"]
+    first = run_program(learning, *words, "--val", "2", "--out", tmp_path)
     curves = {name: json.loads((tmp_path / f"{name}_{task}_32x56_16_2_{seconds}s.json").read_text()) for name in names}
     score = learning.KINDS[task].score
     for points in curves.values():
@@ -25,6 +23,5 @@ def test_models_are_trained_for_the_same_seconds_and_only_once(tmp_path, monkeyp
         assert points[-1][f"val/{score}_identity"] == curves[names[0]][0][f"val/{score}_identity"]
     assert {name for name in names if 0 <= curves[name][-1].get("val/coverage", -1) <= 1} == {"ddpm"} & {*names}
     assert (tmp_path / f"{task}.png").stat().st_size > 0
-    learning.main()
-    assert first.endswith(again := capsys.readouterr().out)
+    assert first.endswith(again := run_program(learning, *words, "--val", "2", "--out", tmp_path))
     assert again.count("|\n") == 2 + len(names)  # the table alone

@@ -2,11 +2,11 @@ import math
 from dataclasses import replace
 from statistics import fmean
 
-import cv2
 import lens_estimation
 import numpy as np
 import pytest
 import torch
+from pictures import save_picture
 
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.video import read_video
@@ -84,8 +84,7 @@ def test_lines_of_one_frame_choose_among_the_lenses_of_an_effect():
 def test_held_out_frames_leave_out_drives_whose_lens_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 8)
     for name in ("train/a_1.png", "val/b_1.png", "val/bent_1.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / name), poles(144, 256))
+        save_picture(tmp_path / name, poles(144, 256))
     rows = lens_estimation.held_out(tmp_path, (144, 256), without=("bent_",))
     assert [row["frame"] for row in rows] == ["val/b_1.png"] * 4
     assert len({row["nothing"] for row in rows}) == 4  # lenses
@@ -99,8 +98,7 @@ def test_a_network_that_is_right_improves_on_the_lines_of_a_frame(tmp_path, monk
     monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 32)
     monkeypatch.setattr(lens_estimation, "_NUM_DRAWS", 1)
     for name in ("train/a_1.png", "val/b_1.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        cv2.imwrite(str(tmp_path / name), np.zeros((144, 256, 3), np.uint8))  # no lines
+        save_picture(tmp_path / name, np.zeros((144, 256, 3), np.uint8))  # no lines
     frames = FrameFolder(tmp_path, size=(144, 256), split="val")
     true = cheap_dashcam().degrade(frames[0].image[None], seed=0, keys=[frames.keys[0]]).restore_flow
     network = lens_estimation.Network(lambda _: true, true)
@@ -113,9 +111,8 @@ def test_pooled_frames_of_a_drive_have_one_lens_and_tell_more_of_it(tmp_path, mo
     monkeypatch.setattr(lens_estimation, "_NUM_LENSES", 32)
     monkeypatch.setattr(lens_estimation, "_NUM_POOLED_LENSES", 32)
     for name in ("train/a_1.png", "val/b_1.png", "val/b_2.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
         picture = poles(144, 256) if name == "val/b_1.png" else np.zeros((144, 256, 3), np.uint8)  # without lines
-        cv2.imwrite(str(tmp_path / name), picture)
+        save_picture(tmp_path / name, picture)
     alone = lens_estimation.held_out(tmp_path, (144, 256))
     pooled = lens_estimation.held_out(tmp_path, (144, 256), pool=True)
     assert [row["frame"] for row in pooled] == ["b"] * 4

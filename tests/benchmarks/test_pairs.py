@@ -1,5 +1,4 @@
 import json
-import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -7,7 +6,7 @@ import numpy as np
 import pairs
 import pytest
 import torch
-from PIL import Image
+from pictures import save_picture
 
 from torchrefract import UniformFog
 
@@ -18,8 +17,7 @@ def args(tmp_path, monkeypatch) -> Namespace:
     generator = np.random.default_rng(0)
     for number in range(4):
         path = tmp_path / "frames" / f"drive{number % 2}" / f"{number}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(generator.integers(0, 256, (24, 40, 3)).astype(np.uint8)).save(path)
+        save_picture(path, generator.integers(0, 256, (24, 40, 3), np.uint8))
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     return Namespace(source=tmp_path / "frames", scene="paper_refractive", size=(24, 40), maps="png", count=4)
 
@@ -40,16 +38,15 @@ def test_engines_are_compared_by_the_time_of_3000_pairs_in_each_round():
     assert ray["speed_by_core_seconds"] == 64 / 80
 
 
-def test_the_command_writes_all_measurements(args, tmp_path, monkeypatch):
+def test_the_command_writes_all_measurements(args, tmp_path, monkeypatch, run_program):
     monkeypatch.setattr(pairs, "make_effects", lambda: {"fog": UniformFog()})
     monkeypatch.setattr(
         pairs, "measure_run", lambda *_: pairs.Run("local", 1, 2.0, 1.0, 10, 20.0, 5.0, 4.0, 50.0, 40.0)
     )
     monkeypatch.setattr(pairs, "measure_one_pair", lambda _: {"generated": 2.0, "read_and_encode": 1.0})
     out = tmp_path / "new" / "pairs.json"
-    words = ["--source", str(args.source), "--size", "24x40", "--workers", "1", "--seconds", "0", "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", ["pairs.py", *words])
-    pairs.main()
+    words = ["--source", args.source, "--size", "24x40", "--workers", "1", "--seconds", "0", "--out", out]
+    run_program(pairs, *words)
     content = json.loads(out.read_text())
     assert pairs.PROTOCOL.keys() <= content.keys()
     assert content["loader"]["fog"] > 0

@@ -1,4 +1,3 @@
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,26 +17,23 @@ def test_the_distance_ignores_exposure_and_is_that_of_the_earth_mover():
 
 
 @pytest.mark.quick
-def test_without_the_pictures_the_command_says_why_it_skips(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(tmp_path / "none")])
-    references.main()
-    assert capsys.readouterr().out == f"skipped: needs real pictures, and {tmp_path / 'none'} does not exist\n"
+def test_without_the_pictures_the_command_says_why_it_skips(tmp_path, run_program):
+    printed = run_program(references, "--data", tmp_path / "none")
+    assert printed == f"skipped: needs real pictures, and {tmp_path / 'none'} does not exist\n"
 
 
-def test_a_pattern_that_names_no_clear_frames_is_an_error(monkeypatch, shared_data, capsys):
-    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(shared_data), "--clear", "frames/none*"])
+def test_a_pattern_that_names_no_clear_frames_is_an_error(run_program, shared_data, capsys):
     with pytest.raises(SystemExit):
-        references.main()
+        run_program(references, "--data", shared_data, "--clear", "frames/none*")
     assert f"--clear must name pictures in {shared_data}, got none for frames/none*" in capsys.readouterr().err
 
 
 def test_a_checkpoint_is_scored_by_the_contrast_of_real_pictures_before_and_after(
-    monkeypatch, shared_data, known_model, capsys
+    run_program, shared_data, known_model
 ):
     checkpoint = known_model("deweather", (0.2, 0.2, 0.2))  # more light with the same differences
-    monkeypatch.setattr(sys, "argv", ["references.py", "--data", str(shared_data), "--restore", str(checkpoint)])
-    references.main()
-    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    printed = run_program(references, "--data", shared_data, "--restore", checkpoint)
+    rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
     assert [name for name, *_ in rows] == ["haze", "fog", "clear"]
     for _, before, after in rows:
         assert 0 < float(after) < float(before) < 1

@@ -1,7 +1,5 @@
 """Costs of the robustness command beside those of a model."""
 
-import sys
-
 import pytest
 import robustness
 import torch
@@ -25,14 +23,11 @@ def test_a_model_predicts_the_clean_picture_and_one_for_each_level_both_times(mo
     assert evaluation > bare > 0
 
 
-def test_the_command_prints_each_scene_and_the_ratio_of_each_model(monkeypatch, capsys):
+def test_the_command_prints_each_scene_and_the_ratio_of_each_model(monkeypatch, run_program):
     monkeypatch.setattr(presets, "SEVERITIES", (3,))
     robustness.scenes.cache_clear()
-    words = ["robustness.py", "--count", "1", "--size", "90x160", "--models", "opencv:hog"]
-    monkeypatch.setattr(sys, "argv", words)
-    robustness.main()
+    lines = run_program(robustness, "--count", "1", "--size", "90x160", "--models", "opencv:hog").splitlines()
     robustness.scenes.cache_clear()
-    lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:7]] == robustness.SCENES
     assert lines[-1].startswith("opencv:hog: ")
     assert "bar <= 1.2 x the model alone" in lines[-1]

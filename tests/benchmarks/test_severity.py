@@ -1,5 +1,3 @@
-import sys
-
 import pytest
 import severity
 import torch
@@ -51,14 +49,11 @@ def test_the_quantity_of_a_severity_is_that_of_each_of_its_effects():
     assert quantity(presets.unpaved_road(3)).split("; ")[2] == "25 ms"
 
 
-def test_the_command_prints_a_row_for_each_severity_and_saves_a_picture(monkeypatch, tmp_path, capsys):
-    words = ["severity.py", "--scenes", "paper_weather", "--count", "1", "--size", "90", "160"]
-    monkeypatch.setattr(sys, "argv", words)
-    severity.main()
-    lines = capsys.readouterr().out.splitlines()
+def test_the_command_prints_a_row_for_each_severity_and_saves_a_picture(tmp_path, run_program):
+    words = ["--scenes", "paper_weather", "--count", "1", "--size", "90", "160"]
+    lines = run_program(severity, *words).splitlines()
     assert [line.split(" | ")[1] for line in lines[2:]] == ["1", "2", "3", "4", "5"]
-    monkeypatch.setattr(sys, "argv", [*words, "--figure", str(tmp_path / "scenes.png")])
-    severity.main()
+    run_program(severity, *words, "--figure", tmp_path / "scenes.png")
     assert (tmp_path / "scenes.png").stat().st_size > 1000
 
 

@@ -3,10 +3,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
 import table1
 import torch
+from pictures import save_picture
 from table1 import MIX, Scores, effects_of
 
 from torchrefract import Frame, LensDistortion, Pair
@@ -69,8 +69,7 @@ def write_frames(tmp_path: Path) -> Path:
     image, _ = render_road_scenes(torch.arange(4), *SIZE, seed=2)
     for i, picture in enumerate(image):
         path = tmp_path / "frames" / ("train" if i < 2 else "val") / f"drive{i}_{i:04d}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), (255 * picture).byte().permute(1, 2, 0).numpy()[..., ::-1])
+        save_picture(path, (255 * picture).byte().permute(1, 2, 0).numpy())
     return tmp_path / "frames"
 
 

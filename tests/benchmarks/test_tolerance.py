@@ -1,5 +1,4 @@
 import json
-import sys
 
 import pytest
 import tolerance
@@ -28,7 +27,7 @@ def test_configurations_at_the_edge_of_their_error_bounds_keep_their_tolerance(n
 
 
 @pytest.mark.quick
-def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_path, capsys):
+def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_path, run_program, capsys):
     trials = [Trial("lens", 64, 64, 0.1, error) for error in (0.02, 0.05, 0.3)]
     assert summary("lens", trials) == (
         "lens: 3 configurations, tolerance EXCEEDED by 1; error / tolerance: largest 3.00, median 0.500; "
@@ -36,9 +35,8 @@ def test_exceeded_tolerances_are_counted_and_end_the_command(monkeypatch, tmp_pa
     )
     out = tmp_path / "new" / "tolerance.json"
     monkeypatch.setattr(tolerance, "attempt", lambda name, seed, largest: trials[seed])
-    monkeypatch.setattr(sys, "argv", ["tolerance.py", "--count", "3", "--only", "Compose", "--out", str(out)])
     with pytest.raises(SystemExit):
-        tolerance.main()
+        run_program(tolerance, "--count", "3", "--only", "Compose", "--out", out)
     assert "EXCEEDED by 1" in capsys.readouterr().out
     assert [trial["error"] for trial in json.loads(out.read_text())] == [0.02, 0.05, 0.3]
 

@@ -1,10 +1,8 @@
 import itertools
 import json
 import random
-import sys
 
 import pytest
-import timing
 import tradeoff
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -54,14 +52,11 @@ def test_labels_do_not_overlap():
     assert 1 < sum(label.get_visible() for label in crowd) < 20
 
 
-def test_the_command_writes_a_table_and_a_plot(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(timing, "_STRETCH_S", 0.0)
+def test_the_command_writes_a_table_and_a_plot(monkeypatch, tmp_path, run_program):
     few = {"lens": variants("mild lens", "tolerance_px")[::3], "flare": variants("flare", "tolerance")}
     monkeypatch.setattr(tradeoff, "settings", lambda: few)
-    words = ["tradeoff.py", "--quick", "--frames", "synthetic", "--threads", "1", "--out", str(tmp_path / "new")]
-    monkeypatch.setattr(sys, "argv", words)
-    tradeoff.main()
-    assert "| flare | tolerance | None |" in capsys.readouterr().out
+    words = ["--quick", "--frames", "synthetic", "--threads", "1", "--out", tmp_path / "new"]
+    assert "| flare | tolerance | None |" in run_program(tradeoff, *words)
     rows = json.loads((tmp_path / "new" / "tradeoff.json").read_text())["rows"]
     assert [row["value"] for row in rows] == ["None", "0.05", "1", "None", "0.1", "0.3", "1"]
     for cost in ("mean_levels", "ratio"):

@@ -1,7 +1,5 @@
 """The search for worst cases beside random search."""
 
-import sys
-
 import pytest
 import torch
 import worst_case
@@ -33,10 +31,8 @@ def test_a_ratio_is_that_of_the_mean_rises():
 
 
 @pytest.mark.filterwarnings("default")
-def test_the_command_prints_a_row_for_each_model_and_effect(monkeypatch, capsys):
+def test_the_command_prints_a_row_for_each_model_and_effect(run_program):
     words = ["--count", "2", "--size", "27x48", "--steps", "2", "--restarts", "1", "--effects", "UniformFog", "lens"]
-    monkeypatch.setattr(sys, "argv", ["worst_case.py", *words])
-    worst_case.main()
-    _, *rows = capsys.readouterr().out.splitlines()
+    _, *rows = run_program(worst_case, *words).splitlines()
     assert [row.split()[:2] for row in rows] == [[m, e] for m in worst_case.MODELS for e in ("UniformFog", "lens")]
     assert all("bar >= 1.3 x random search" in row for row in rows)

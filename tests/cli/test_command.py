@@ -5,11 +5,9 @@ import random
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import time
 import warnings
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
+from processes import running
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
@@ -71,10 +70,7 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
     for error, message in (
         (UsageError("count must be\n above 0"), "count must be above 0"),
         (UnreadableImageError("Traceback …\nValueError: a.png is empty"), "a.png is empty"),
-        (
-            OSError(errno.ENOSPC, "No space left on device", "run/a.csv"),
-            "run/a.csv could not be written: No space left",
-        ),
+        (OSError(errno.ENOSPC, "No space left", "run/a.csv"), "run/a.csv could not be written: No space left"),
         (FileExistsError(errno.EEXIST, "File exists", "a.yaml"), "a.yaml could not be written: File exists"),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b could not be written: Not a directory"),
         (PermissionError(errno.EACCES, "Permission denied", "frames"), "frames could not be opened: Permission denied"),
@@ -104,16 +100,11 @@ def test_an_interrupt_while_a_command_loads_is_one_line(capsys, monkeypatch):
 
 
 def test_ctrl_c_while_the_package_is_imported_is_one_line():
-    words = [sys.executable, "-m", "torchrefract.degrade"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    options = {"env": environment, "stderr": subprocess.PIPE, "text": True}
-    # A shell lets programs in the background ignore it.
-    options["preexec_fn"] = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(words, **options) as process:
+    with running("-m", "torchrefract.degrade") as process:
         assert process.stderr is not None
         assert process.stderr.readline() == "torchrefract: loading …\n"
         process.send_signal(signal.SIGINT)
-        assert process.stderr.read() == "stopped\n"
+        assert process.communicate() == (None, "stopped\n")
     assert process.returncode not in (None, 0)
 
 
@@ -180,17 +171,8 @@ def test_progress_hands_on_its_items_and_prints_a_line_outside_a_terminal_only_i
 # --- arguments
 
 
-ODD_NAMES = (
-    "Größe",
-    "clip (1)",
-    "epoch=1-step=20",
-    "it#5%",
-    "a@b, [c] {d}: e",
-    "a${seed}b",
-    "line\nbreak",
-    "null",
-    "霧~ $HOME `x` 1e3",
-)
+ODD_NAMES = ("Größe", "clip (1)", "epoch=1-step=20", "it#5%", "a@b, [c] {d}: e", "a${seed}b", "line\nbreak", "null")
+ODD_NAMES += ("霧~ $HOME `x` 1e3",)
 ODD_ENDS = ("'quoted'", '"', "back\\slash\\")  # which could end the quotes around a name, or escape them
 # The options of each command that take the name of a file, and the arguments that it needs.
 FILE_OPTIONS = {
@@ -272,19 +254,8 @@ def test_names_of_files_are_the_values_of_a_multirun(call, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} >= {"ä=1.pdf", "b#2.pdf"}
 
 
-COMMANDS = (
-    "train",
-    "eval",
-    "preview",
-    "degrade",
-    "generate",
-    "restore",
-    "export",
-    "calibrate",
-    "rectify",
-    "make_board",
-    "playground",
-)
+COMMANDS = ("train", "eval", "preview", "degrade", "generate", "restore", "export")
+COMMANDS += ("calibrate", "rectify", "make_board", "playground")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -362,10 +333,7 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
     ("word", "message"),
     [
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
-        (
-            "model=unet",
-            "model must be one of bridge, ddpm, ddpm_cat256, ddpm_image, fog_net, lens_net, resunet, segformer, got un",
-        ),
+        ("model=unet", "model must be one of bridge, ddpm, ddpm_cat256, .* resunet, segformer, got unet$"),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
         ("logger=false", "logger must be one of csv, tensorboard, wandb, got false$"),
         ("data=null", "data must be one of frames, pairs, road_scenes, got null$"),
@@ -395,11 +363,8 @@ def test_a_missing_gpu_is_one_line_of_error(call, small):
 def test_a_multirun_has_a_folder_for_each_job(call, small, tmp_path):
     words = ("-m", "+task=undistort", *small, "trainer.max_epochs=0", "seed=3,4", "hydra.sweep.dir=sweep")
     assert (outcome := call("train", *words)).code == 0, outcome.err
-    configs = tmp_path.glob("sweep/*/config.yaml")
-    assert {path.parent.name: OmegaConf.select(OmegaConf.load(path), "data.seed") for path in configs} == {
-        "0": 3,
-        "1": 4,
-    }
+    for job, seed in enumerate((3, 4)):
+        assert OmegaConf.select(OmegaConf.load(tmp_path / f"sweep/{job}/config.yaml"), "data.seed") == seed
 
 
 # --- frames

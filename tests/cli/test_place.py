@@ -5,12 +5,11 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from PIL import Image
+from pictures import save_picture, save_turned
 
 from torchrefract import presets
 from torchrefract.cameras.camera import Camera
@@ -31,10 +30,9 @@ FOG = "scene=cape_town_fog"
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """Write the frames a.png and b.png, 48 x 64, and camera.yaml of them."""
-    (tmp_path / "frames").mkdir()
     for i, name in enumerate("ab"):
         pixels = np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-        cv2.imwrite(str(tmp_path / "frames" / f"{name}.png"), pixels)
+        save_picture(tmp_path / "frames" / f"{name}.png", pixels)
     write_camera(tmp_path / "camera.yaml", 48, 64)
     return tmp_path
 
@@ -99,9 +97,7 @@ def test_a_folder_is_not_continued_with_another_camera_in_the_file_of_the_scene(
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_frames_that_a_tag_turns_are_warned_of_beside_a_camera(call, folder, command):
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    Image.new("RGB", (64, 48)).save(folder / "frames" / "c.jpg", exif=exif)
+    save_turned(folder / "frames" / "c.jpg", np.zeros((48, 64, 3), np.uint8), 3)
     source = ("image=frames", "frames=3") if command == "preview" else COMMANDS[command]
     suffix = ".apng" if command == "preview" else ""
     warning = "c.jpg. They are read as displayed, and so labels and a camera must be of the displayed pictures"
@@ -149,9 +145,7 @@ def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(cal
     assert scored.code == 0, scored.err
     assert "as in its own validation" in scored.out
     write_camera(folder / "camera.yaml", 48, 64)
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    Image.new("RGB", (64, 48)).save(folder / "drives" / "v" / "a.png", exif=exif)
+    save_turned(folder / "drives" / "v" / "a.png", np.zeros((48, 64, 3), np.uint8), 3)
     again = call("train", *options, *PLACE, "hydra.run.dir=turned", "trainer.accelerator=none")  # checked later
     assert "rotation of a video): a.png. They are read as displayed, and so labels and a camera must be" in again.err
     shutil.copy(folder / "frames" / "a.png", folder / "drives" / "v")

@@ -3,12 +3,10 @@
 import importlib
 import inspect
 import json
-import os
 import re
 import shutil
 import socket
 import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -20,7 +18,9 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from pictures import save_picture, smooth_picture
 from PIL import Image
+from processes import running
 
 import torchrefract as tr
 from torchrefract._io import CONFIG_DIR
@@ -36,9 +36,7 @@ OF_CLIPS = re.compile(r"(wind_.|drift_.|decorrelation|rate|time_constant)_range"
 
 
 def write_picture(path: Path, height: int = 48, width: int = 96) -> Path:
-    y, x = np.mgrid[:height, :width]
-    waves = [127 + 100 * np.sin(x / (9 + c)) * np.cos(y / (11 - c)) for c in range(3)]
-    Image.fromarray(np.stack(waves, axis=-1).astype(np.uint8)).save(path)
+    save_picture(path, smooth_picture(height, width))
     return path
 
 
@@ -145,11 +143,8 @@ def page(tmp_path_factory) -> Iterator[str]:
     """Serve the page by its command, without a proxy or a network; return its address."""
     pytest.importorskip("gradio", reason="gradio is in the extra playground")
     port, folder = free_port(), tmp_path_factory.mktemp("page")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     words = ["-m", "torchrefract.playground", f"port={port}", "browser=false"]
-    with subprocess.Popen(
-        [sys.executable, *words], cwd=folder, env=environment, stdout=subprocess.PIPE, text=True
-    ) as server:
+    with running(*words, cwd=folder, stdout=subprocess.PIPE) as server:
         assert server.stdout is not None
         assert f"http://127.0.0.1:{port} shows the page" in server.stdout.readline()
         yield f"http://127.0.0.1:{port}"
@@ -188,7 +183,7 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
     raise AssertionError(f"the page showed no {what} in two minutes")
 
 
-def test_in_a_browser_a_moved_slider_shows_another_picture_and_the_copied_code_makes_it(page, browser, tmp_path):
+def test_in_a_browser_a_moved_slider_shows_another_picture_and_the_copied_code_makes_it(page, browser, spawn, tmp_path):
     file = write_picture(tmp_path / "frame.png", 120, 200)
 
     def pictures() -> list[str]:
@@ -214,8 +209,7 @@ def test_in_a_browser_a_moved_slider_shows_another_picture_and_the_copied_code_m
     read = "const done = arguments[0]; setTimeout(() => navigator.clipboard.readText().then(done), 500)"
     code = browser.execute_async_script(read)
     assert "visibility_range=(" in code
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert spawn("-c", code, cwd=tmp_path).code == 0
     with urllib.request.urlopen(pictures()[1]) as answer:
         (tmp_path / "seen.png").write_bytes(answer.read())
     seen, made = (np.asarray(Image.open(tmp_path / name)) for name in ("seen.png", "degraded.png"))

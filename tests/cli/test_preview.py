@@ -3,20 +3,19 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
-import matplotlib.image
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from pictures import load_frames, save_clip
 from PIL import Image
 
 import torchrefract as tr
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import prepare_arguments
-from torchrefract.data.images import fit, read_image
+from torchrefract.data.images import fit, pixels_of, read_image
 from torchrefract.data.media import read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
@@ -67,8 +66,7 @@ def shows(picture: np.ndarray, cell: np.ndarray) -> bool:
 def sheet_shows(sheet: Path, cell: torch.Tensor | None) -> bool:
     """Return True if a saved contact sheet contains (3, h, w)."""
     assert cell is not None
-    pixels = (255 * matplotlib.image.imread(sheet)[..., :3]).round().astype(np.uint8)
-    return shows(pixels, (255 * cell).round().byte().movedim(0, -1).numpy())
+    return shows(load_frames(sheet)[0], pixels_of(cell))
 
 
 def row_of(effect: Effect, frame: torch.Tensor, *, seed: int = 0, depth: np.ndarray | None = None) -> ContactSheetRow:
@@ -76,18 +74,9 @@ def row_of(effect: Effect, frame: torch.Tensor, *, seed: int = 0, depth: np.ndar
     return contact_sheet_row("", effect, frame=frame, seed=seed, depth=meters)
 
 
-def pictures_of(path: Path) -> list[np.ndarray]:
-    with Image.open(path) as image:
-        pictures = []
-        for t in range(getattr(image, "n_frames", 1)):
-            image.seek(t)
-            pictures.append(np.asarray(image.convert("RGB")))
-    return pictures
-
-
 def still(path: Path, effect: Effect, frame: torch.Tensor, **options: Any) -> bool:
     """Return True if a single picture shows a frame (1, 3, 24, 32) that an effect has degraded."""
-    (shown,) = pictures_of(path)
+    (shown,) = load_frames(path)
     return shows(shown, as_displayed(effect.degrade(frame, seed=0, **options).image[0]))
 
 
@@ -98,15 +87,7 @@ def flare_at(frame: torch.Tensor, t: int) -> np.ndarray:
 
 def as_displayed(image: torch.Tensor, *, factor: int = 10) -> np.ndarray:
     """Return (3, 24, 32) as an animation shows it, (240, 320, 3)."""
-    pixels = (255 * image).round().byte().movedim(0, -1).numpy()
-    return pixels.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def write_video(path: Path, frames: list[torch.Tensor]) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 24))
-    for frame in frames:
-        writer.write((255 * frame[0]).round().byte().movedim(0, -1).numpy()[..., ::-1])
-    writer.release()
+    return pixels_of(image).repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 # --- contact sheets
@@ -198,11 +179,8 @@ def test_only_a_bare_word_is_a_picture_and_there_is_at_most_one(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     overrides, options = ["seed=1", "~effects.Compose", "+a=b"], ["--config-dir", "mine", "-c", "job", "--resolve"]
     assert prepare_arguments("preview", overrides + options) == overrides + options
-    assert prepare_arguments("preview", [*options, "frame.png", *overrides]) == [
-        "image='frame.png'",
-        *overrides,
-        *options,
-    ]
+    words = prepare_arguments("preview", [*options, "frame.png", *overrides])
+    assert words == ["image='frame.png'", *overrides, *options]
     with pytest.raises(UsageError, match=r"one picture, in quotes .*, got my and frame\.png"):
         prepare_arguments("preview", ["my", "frame.png"])
 
@@ -369,7 +347,7 @@ def test_a_picture_becomes_an_animation(call, picture, tmp_path):
     assert (outcome.code, outcome.err) == (0, "")
     assert outcome.out == "flare.apng: limpopo_sun_glare on frame.png, 4 frames\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["flare.apng", "frame.png"]
-    pictures = pictures_of(tmp_path / "flare.apng")
+    pictures = load_frames(tmp_path / "flare.apng")
     assert len(pictures) == 4
     for t, shown in enumerate(pictures):
         assert shows(shown, flare_at(read_image(picture)[None], t))
@@ -379,7 +357,7 @@ def test_a_picture_becomes_an_animation(call, picture, tmp_path):
 def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
     assert call("preview", *FOG, "size=[24,32]", "seed=7", "out=fog.apng", "frames=2").code == 0
     frame, depth = render_road_scenes(torch.tensor([7]), 24, 32)
-    for t, shown in enumerate(pictures_of(tmp_path / "fog.apng")):
+    for t, shown in enumerate(load_frames(tmp_path / "fog.apng")):
         assert shows(shown, as_displayed(cape_town_fog().degrade(frame, seed=7, depth=depth, frame=t).image[0]))
 
 
@@ -387,7 +365,7 @@ def test_an_animation_of_a_rendered_scene_has_its_depth(call, tmp_path):
 def test_each_frame_of_an_animation_has_its_map_of_a_folder(call, frames, tmp_path, source):
     names = [f"frame{t}" for t in range(3)]
     if source == "drive.avi":
-        write_video(tmp_path / source, frames)
+        save_clip(tmp_path / source, [pixels_of(frame[0]) for frame in frames])
         frames = [frame for _, frame in read_video(tmp_path / source, range(12))]
         names = [f"{source}/{t:06d}" for t in range(3)]
     depths = [torch.full((1, 1, 24, 32), 5.0 + 40 * t) for t in range(3)]
@@ -396,7 +374,7 @@ def test_each_frame_of_an_animation_has_its_map_of_a_folder(call, frames, tmp_pa
         np.save(path, depth[0, 0])
     outcome = call("preview", source, *FOG, "depth=depth", "frames=3", "out=fog.apng")
     assert (outcome.code, outcome.err) == (0, "")
-    for t, (picture, depth) in enumerate(zip(pictures_of(tmp_path / "fog.apng"), depths, strict=True)):
+    for t, (picture, depth) in enumerate(zip(load_frames(tmp_path / "fog.apng"), depths, strict=True)):
         image = cape_town_fog().degrade(frames[t], seed=0, depth=depth, frame=t).image[0]
         assert shows(picture, as_displayed(image)), t
     missing = "frame3.png" if source == "drive" else source
@@ -418,17 +396,17 @@ def test_a_folder_is_played_in_the_order_of_its_numbers(call, frames, tmp_path):
     for max_frames, count in ((3, 3), (100, 12)):
         outcome = call("preview", "drive", *FLARE, "out=flare.apng", f"frames={max_frames}")
         assert outcome.out == f"flare.apng: limpopo_sun_glare on drive, {count} frames\n"
-    pictures = pictures_of(tmp_path / "flare.apng")
+    pictures = load_frames(tmp_path / "flare.apng")
     assert len(pictures) == 12
     assert all(shows(shown, flare_at(frames[t], t)) for t, shown in enumerate(pictures))
 
 
 def test_a_video_is_played_and_its_first_frame_is_that_of_a_contact_sheet(call, frames, tmp_path):
     path = tmp_path / "a: 100%05d.avi"  # neither a protocol nor a pattern of names
-    write_video(path, frames)
+    save_clip(path, [pixels_of(frame[0]) for frame in frames])
     decoded = [frame for _, frame in read_video(path, range(12))]
     assert call("preview", path.name, *FLARE, "out=flare.apng").out.endswith("12 frames\n")
-    for t, shown in enumerate(pictures_of(tmp_path / "flare.apng")):
+    for t, shown in enumerate(load_frames(tmp_path / "flare.apng")):
         assert shows(shown, flare_at(decoded[t], t))
     assert call("preview", path.name, *FLARE, "out=sheet.png").code == 0
     first = torch.from_numpy(flare_at(decoded[0], 0).copy()).movedim(-1, 0) / 255
@@ -444,7 +422,7 @@ def test_an_animation_is_read_like_a_video(call, picture, tmp_path):
 def test_frames_are_cropped_and_reduced(call, frames, tmp_path):
     assert call("preview", "drive", *LENS, "size=[12,16]", "out=lens.apng", "frames=2").code == 0
     image = tr.LensDistortion().degrade(fit(frames[1][0], (12, 16)), seed=0).image
-    assert shows(pictures_of(tmp_path / "lens.apng")[1], as_displayed(image, factor=20))
+    assert shows(load_frames(tmp_path / "lens.apng")[1], as_displayed(image, factor=20))
 
 
 def test_frames_that_cannot_be_played_are_one_line_of_error(call, frames, picture, tmp_path):

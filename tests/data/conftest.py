@@ -1,4 +1,3 @@
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -75,17 +74,6 @@ def tars(tmp_path_factory, frames) -> Path:
     for i in range(0, len(tasks), 3):
         manifest.add(storage.write(tasks[i : i + 3], generator))
     return out
-
-
-@pytest.fixture(scope="session")
-def sums() -> Callable[[Path], dict[str, str]]:
-    """Return the checksum of each file of a set, hidden ones included."""
-
-    def of(out: Path) -> dict[str, str]:
-        files = sorted(path for path in out.rglob("*") if path.is_file())
-        return {path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-    return of
 
 
 @pytest.fixture(scope="session")

@@ -3,21 +3,20 @@
 import errno
 import io
 import re
-import resource
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from itertools import count, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import av
 import cv2
 import numpy as np
 import pytest
 import torch
 from av.codec.context import Flags
+from pictures import load_clip, open_media, save_media, sound_of, times_of
 from PIL import ExifTags, Image, ImageCms, ImageOps, PngImagePlugin
 
 from torchrefract._validation import UsageError
@@ -43,75 +42,31 @@ TURNS = [(a, b, 0, c, d, 0, 0, 0, 1 << 14) for a, b, c, d in (
 TIMES_MS = [0, 40, 80, 120, 1400, 1440, 1480, 2600]  # a phone in the dark
 
 
-def media_file(path: Path, mode: Literal["r", "w"] = "r") -> Any:
-    return av.open(str(path), mode)
-
-
-def shown_by_opencv(path: Path) -> np.ndarray:
-    return np.asarray(cv2.VideoCapture(str(path)).read()[1])[..., ::-1].astype(float)
-
-
 def page(k: int = 0, *, height: int = 32, width: int = 48) -> np.ndarray:
     """Return (H, W, 3), uint8, smooth, and different in all its corners."""
     y, x = np.mgrid[:height, :width]
     return np.dstack([3 * x + 20, 5 * y + 20, 100 + x + y + 10 * k]).clip(0, 255).astype(np.uint8)
 
 
-def write(
-    path: Path,
-    pages: Sequence[np.ndarray],
-    *,
-    times: Sequence[int] = (),
-    unit: Fraction = Fraction(1, 1000),
-    codec: str = "libx264",
-    pix_fmt: str = "yuv420p",
-    sound: str = "",
-    matrix: tuple[int, ...] = TURNS[0],
-    space: int = 2,
-) -> None:
-    """Write a video of pages at times, with a sine as its sound."""
-    with media_file(path, "w") as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.height, stream.width = pages[0].shape[:2]
-        stream.pix_fmt, stream.colorspace = pix_fmt, space
-        stream.codec_context.time_base = stream.time_base = unit
-        if matrix != TURNS[0]:
-            stream.set_display_matrix(matrix)
-        track: Any = None
-        if sound:
-            track = container.add_stream(sound, rate=48000, layout="mono")
-        for pixels, t in zip(pages, times or range(len(pages)), strict=True):
-            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame = frame.reformat(format=pix_fmt, dst_colorspace=space if space != 2 else 5, threads=1)
-            frame.pts, frame.time_base = t, unit
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-        for start in range(0, 48000 if track else 0, 960):
-            wave = (9000 * np.sin(np.arange(start, start + 960) / 17)).astype(np.int16)[None]
-            frame = av.AudioFrame.from_ndarray(wave, format="s16", layout="mono")
-            frame.sample_rate, frame.pts = 48000, start
-            for resampled in av.AudioResampler(track.codec_context.format, "mono", 48000).resample(frame):
-                container.mux(track.encode(resampled))
-        if track:
-            container.mux(track.encode(None))
-
-
-def times_of(path: Path) -> list[float]:
-    with media_file(path) as container:
-        return [frame.time for frame in container.decode(video=0)]
-
-
 def duration_of_sound(path: Path) -> float:
     """Return the seconds of sound that the file states."""
-    with media_file(path) as container:
+    with open_media(path) as container:
         return float(container.streams.audio[0].duration * container.streams.audio[0].time_base)
 
 
-def samples_of(path: Path) -> tuple[float, np.ndarray]:
-    """Return the time of the first sample, and all samples."""
-    with media_file(path) as container:
-        frames = list(container.decode(audio=0))
-    return frames[0].time, np.concatenate([frame.to_ndarray() for frame in frames], axis=1)
+def remux(
+    source: Path, target: Path, *, shift_s: int = 0, prepare: Callable[[Any, Any], None] = lambda *_: None
+) -> None:
+    """Copy the packets of a file, later by whole seconds; `prepare` changes the new container and its first stream."""
+    with open_media(source) as old, open_media(target, "w") as new:
+        copies = {stream: new.add_stream_from_template(stream) for stream in old.streams}
+        prepare(new, new.streams.video[0])
+        for packet in old.demux():
+            if packet.dts is not None:
+                packet.pts += int(shift_s / packet.time_base)
+                packet.dts += int(shift_s / packet.time_base)
+                packet.stream = copies[packet.stream]
+                new.mux(packet)
 
 
 def equal(new: np.ndarray, samples: np.ndarray) -> bool:
@@ -139,7 +94,7 @@ def turned(pixels: np.ndarray, matrix: tuple[int, ...]) -> np.ndarray:
 
 @pytest.mark.parametrize("matrix", TURNS)
 def test_a_turned_video_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_path, matrix):
-    write(tmp_path / "a.mp4", [page(k) for k in range(3)], times=(0, 40, 80), matrix=matrix)
+    save_media(tmp_path / "a.mp4", [page(k) for k in range(3)], times=(0, 40, 80), matrix=matrix)
     stored, displayed = (
         as_pixels(next(read_video(tmp_path / "a.mp4", [1], upright=upright))[1]) for upright in (False, True)
     )
@@ -156,13 +111,11 @@ def test_a_turned_video_is_read_as_displayed_or_as_stored_and_stays_upright(tmp_
 @pytest.mark.parametrize("quarter", [0, 90, 180, 270])
 def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
     c, s = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[quarter]
-    write(tmp_path / "a.mp4", [page()], matrix=(c * ONE, s * ONE, 0, -s * ONE, c * ONE, 0, 0, 0, 1 << 14))
-    expected = shown_by_opencv(tmp_path / "a.mp4")
-    ours = as_pixels(next(read_video(tmp_path / "a.mp4", [0]))[1])
-    assert np.abs(ours - expected).mean() < 2
+    save_media(tmp_path / "a.mp4", [page()], matrix=(c * ONE, s * ONE, 0, -s * ONE, c * ONE, 0, 0, 0, 1 << 14))
+    expected = load_clip(tmp_path / "a.mp4")[0].astype(float)
+    assert np.abs(as_pixels(next(read_video(tmp_path / "a.mp4", [0]))[1]) - expected).mean() < 2
     convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged, upright=False)
-    result = shown_by_opencv(tmp_path / "b.mp4")
-    assert np.abs(result - expected).mean() < 3
+    assert np.abs(load_clip(tmp_path / "b.mp4")[0] - expected).mean() < 3
 
 
 @pytest.mark.parametrize(
@@ -181,21 +134,14 @@ def test_opencv_shows_a_converted_video_as_the_original(tmp_path, quarter):
 def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, times, sound):
     source, target = tmp_path / f"a{suffix}", tmp_path / "b.mp4"
     pages = [page(k) for k in range(8)]
-    write(
-        source,
-        pages,
-        times=times,
-        unit=unit,
-        codec=codec,
-        sound=sound,
-        pix_fmt="yuvj420p" if codec == "mjpeg" else "yuv420p",
-    )  # options in one place
+    pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    save_media(source, pages, times=times, unit=unit, codec=codec, sound=sound, pix_fmt=pix_fmt)
     assert describe_losses([source], upright=True) == []
     assert convert_video(source, target, change=unchanged) == 8
     if suffix not in (".avi", ".ts"):  # of one rate, and with a start above 0
         assert times_of(source) == pytest.approx([float(t * unit) for t in times], abs=1e-3)
     assert times_of(target) == pytest.approx(times_of(source), abs=1e-3)
-    (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
+    (start, samples), (new_start, new_samples) = sound_of(source), sound_of(target)
     # MKV rounds the start of compressed sound to 1 ms. FFmpeg's decoder ignores where MP4 ends it, so the padding of
     # Opus follows the samples, but the file states the end.
     shift = next(k for k in range(-48, 49) if equal(new_samples[:, max(0, k) :], samples[:, max(0, -k) :]))
@@ -210,19 +156,12 @@ def test_a_converted_video_keeps_times_and_sound(tmp_path, suffix, codec, unit, 
 
 def test_whole_seconds_before_the_first_frame_and_sound_are_left_out(tmp_path):
     first, source, target = tmp_path / "a.ts", tmp_path / "b.ts", tmp_path / "c.mp4"
-    write(first, [page(k) for k in range(8)], times=[40 * k for k in range(8)], sound="aac")
-    with media_file(first) as original, media_file(source, "w") as shifted:
-        copies = {stream: shifted.add_stream_from_template(stream) for stream in original.streams}
-        for packet in original.demux():
-            if packet.dts is not None:
-                packet.pts += int(9000 / packet.time_base)  # the camera was switched on 2.5 h before
-                packet.dts += int(9000 / packet.time_base)
-                packet.stream = copies[packet.stream]
-                shifted.mux(packet)
+    save_media(first, [page(k) for k in range(8)], times=[40 * k for k in range(8)], sound="aac")
+    remux(first, source, shift_s=9000)  # the camera was switched on 2.5 h before
     assert times_of(source)[0] >= 9000
     assert convert_video(source, target, change=unchanged) == 8
     assert times_of(target) == pytest.approx([t % 1 for t in times_of(source)], abs=1e-3)
-    (start, samples), (new_start, new_samples) = samples_of(source), samples_of(target)
+    (start, samples), (new_start, new_samples) = sound_of(source), sound_of(target)
     assert times_of(target)[0] - new_start == pytest.approx(times_of(source)[0] - start, abs=1e-3)
     assert new_samples.shape == samples.shape
 
@@ -230,39 +169,31 @@ def test_whole_seconds_before_the_first_frame_and_sound_are_left_out(tmp_path):
 @pytest.mark.parametrize(("space", "pix_fmt"), [(1, "yuv420p"), (5, "yuv420p"), (9, "yuv420p"), (2, "yuvj420p")])
 def test_colors_are_read_by_the_matrix_and_range_of_the_video_and_kept(tmp_path, space, pix_fmt):
     flat = np.full((32, 48, 3), (200, 60, 30), np.uint8)
-    write(tmp_path / "a.mp4", [flat], space=space, pix_fmt=pix_fmt)
+    save_media(tmp_path / "a.mp4", [flat], space=space, pix_fmt=pix_fmt)
     convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged)
     for name in ("a.mp4", "b.mp4"):
         _, frame = next(read_video(tmp_path / name, [0]))
         assert np.abs(as_pixels(frame) - flat).max() < 3, name
-    with media_file(tmp_path / "b.mp4") as container:
+    with open_media(tmp_path / "b.mp4") as container:
         assert next(container.decode(video=0)).colorspace == space
 
 
 def test_pixels_that_are_not_square_keep_their_shape(tmp_path):
-    write(tmp_path / "a.mp4", [page()], matrix=TURNS[-1])
-    with media_file(tmp_path / "a.mp4") as source, media_file(tmp_path / "wide.mp4", "w") as wide:
-        stream = wide.add_stream_from_template(source.streams.video[0])
+    def widen(_: Any, stream: Any) -> None:
         stream.sample_aspect_ratio = stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
         stream.set_display_matrix(TURNS[-1])
-        for packet in source.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                wide.mux(packet)
+
+    save_media(tmp_path / "a.mp4", [page()], matrix=TURNS[-1])
+    remux(tmp_path / "a.mp4", tmp_path / "wide.mp4", prepare=widen)
     for upright, ratio in ((False, Fraction(4, 3)), (True, Fraction(3, 4))):
         convert_video(tmp_path / "wide.mp4", tmp_path / "b.mp4", change=unchanged, upright=upright)
-        with media_file(tmp_path / "b.mp4") as container:
+        with open_media(tmp_path / "b.mp4") as container:
             assert container.streams.video[0].sample_aspect_ratio == ratio
 
 
 def test_a_title_that_is_not_unicode_is_read_over(tmp_path):
-    with media_file(tmp_path / "a.avi", "w") as container:
-        stream = container.add_stream("mjpeg", rate=25)
-        stream.height, stream.width, stream.pix_fmt = 32, 48, "yuvj420p"
-        container.metadata["title"] = "Strasse"
-        frame = av.VideoFrame.from_ndarray(page(), format="rgb24")
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    options: dict[str, Any] = {"codec": "mjpeg", "pix_fmt": "yuvj420p", "unit": Fraction(1, 25)}
+    save_media(tmp_path / "a.avi", [page()], **options, prepare=lambda new, _: new.metadata.update(title="Strasse"))
     content = (tmp_path / "a.avi").read_bytes()
     assert b"Strasse" in content
     (tmp_path / "a.avi").write_bytes(content.replace(b"Strasse", b"Stra\xdfe."))
@@ -274,7 +205,7 @@ def test_a_title_that_is_not_unicode_is_read_over(tmp_path):
 @pytest.mark.parametrize("angle", [10, 45, -80, 170])
 def test_a_video_that_is_turned_by_an_odd_angle_raises(tmp_path, angle):
     c, s = (round(ONE * f(np.deg2rad(angle))) for f in (np.cos, np.sin))
-    write(tmp_path / "a.mp4", [page()], matrix=(c, s, 0, -s, c, 0, 0, 0, 1 << 14))
+    save_media(tmp_path / "a.mp4", [page()], matrix=(c, s, 0, -s, c, 0, 0, 0, 1 << 14))
     message = rf"a\.mp4 must be turned for display by a multiple of 90 degrees, got {angle}; remove its tag: ffmpeg "
     with pytest.raises(UnreadableImageError, match=message):
         next(read_video(tmp_path / "a.mp4", count()))
@@ -284,13 +215,10 @@ def test_a_video_that_is_turned_by_an_odd_angle_raises(tmp_path, angle):
 
 
 def test_an_interlaced_video_is_warned_of_once(tmp_path):
-    with media_file(tmp_path / "a.mp4", "w") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+    def interlace(_: Any, stream: Any) -> None:
         stream.codec_context.flags |= Flags.interlaced_dct
-        for k in range(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(page(k), format="rgb24")))
-        container.mux(stream.encode(None))
+
+    save_media(tmp_path / "a.mp4", [page(k) for k in range(3)], prepare=interlace)
     with pytest.warns(UserWarning, match=r"a\.mp4 is interlaced: .* Deinterlace it first: ffmpeg .*bwdif") as caught:
         assert convert_video(tmp_path / "a.mp4", tmp_path / "b.mp4", change=unchanged) == 3
     assert len(caught) == 1
@@ -298,12 +226,10 @@ def test_an_interlaced_video_is_warned_of_once(tmp_path):
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG"), (1, None), (13, None)])
 def test_a_video_of_high_dynamic_range_is_warned_of_once(tmp_path, transfer, name):
-    with media_file(tmp_path / "a.mp4", "w") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt, stream.color_trc = 48, 32, "yuv420p", transfer
-        for k in range(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(page(k), format="rgb24")))
-        container.mux(stream.encode(None))
+    def state_transfer(_: Any, stream: Any) -> None:
+        stream.color_trc = transfer
+
+    save_media(tmp_path / "a.mp4", [page(k) for k in range(3)], prepare=state_transfer)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert len([*read_video(tmp_path / "a.mp4", count())]) == 3
@@ -341,16 +267,12 @@ def test_a_forked_process_frees_what_was_read_and_written(tmp_path, spawn):
 
 
 def test_what_a_video_loses_is_described(tmp_path):
-    write(tmp_path / "law.mov", [page()], sound="pcm_mulaw")
-    write(tmp_path / "deep.mkv", [page()], pix_fmt="yuv420p10le", sound="flac")
-    write(tmp_path / "clear.mov", [page()], codec="qtrle", pix_fmt="argb")
-    with media_file(tmp_path / "law.mov") as source, media_file(tmp_path / "notes.mkv", "w") as target:
-        stream = target.add_stream_from_template(source.streams.video[0])
-        target.add_attachment("notes.txt", "text/plain", b"notes")
-        for packet in source.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                target.mux(packet)
+    save_media(tmp_path / "law.mov", [page()], sound="pcm_mulaw")
+    save_media(tmp_path / "deep.mkv", [page()], pix_fmt="yuv420p10le", sound="flac")
+    save_media(tmp_path / "clear.mov", [page()], codec="qtrle", pix_fmt="argb")
+    notes = "notes.txt", "text/plain", b"notes"
+    save_media(tmp_path / "silent.mov", [page()])
+    remux(tmp_path / "silent.mov", tmp_path / "notes.mkv", prepare=lambda new, _: new.add_attachment(*notes))
     files = [tmp_path / name for name in ("law.mov", "deep.mkv", "clear.mov", "notes.mkv")]
     assert describe_losses(files, upright=True) == [
         "the sound is not kept, since MP4 cannot hold pcm_mulaw: law.mov",
@@ -363,7 +285,7 @@ def test_what_a_video_loses_is_described(tmp_path):
 
 
 def test_a_sound_and_a_video_of_an_unknown_codec_are_named(tmp_path):
-    write(tmp_path / "a.mov", [page()], sound="aac")
+    save_media(tmp_path / "a.mov", [page()], sound="aac")
     data = (tmp_path / "a.mov").read_bytes()
     (tmp_path / "phone.mov").write_bytes(data.replace(b"mp4a", b"apac").replace(b"esds", b"????"))
     (tmp_path / "video.mov").write_bytes(data.replace(b"avc1", b"????"))
@@ -376,7 +298,7 @@ def test_a_sound_and_a_video_of_an_unknown_codec_are_named(tmp_path):
 
 
 def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
-    write(tmp_path / "a.avi", [page(k) for k in range(6)], codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
+    save_media(tmp_path / "a.avi", [page(k) for k in range(6)], codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
     data = bytearray((tmp_path / "a.avi").read_bytes())
     second = data.index(b"\x89PNG", data.index(b"\x89PNG") + 1)
     data[second : second + 60] = bytes(60)
@@ -388,16 +310,16 @@ def test_frames_after_damage_are_kept_and_the_damage_is_warned_of(tmp_path):
     assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.12, 0.16, 0.2], abs=1e-3)
     with pytest.warns(UserWarning, match="1 damaged frames"):
         assert is_complete(tmp_path / "a.avi", tmp_path / "b.mp4")  # so that the next run does not convert it again
-    write(tmp_path / "c.avi", [page()] * 7, codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
+    save_media(tmp_path / "c.avi", [page()] * 7, codec="png", pix_fmt="rgb24", unit=Fraction(1, 25))
     assert not is_complete(tmp_path / "c.avi", tmp_path / "b.mp4")
 
 
 def test_frames_that_change_their_size_raise(tmp_path):
     for name, size in (("a", (32, 48)), ("b", (48, 64))):
-        write(tmp_path / f"{name}.mkv", [page(height=size[0], width=size[1])], codec="mjpeg", pix_fmt="yuvj420p")
-    with media_file(tmp_path / "both.mkv", "w") as target:
+        save_media(tmp_path / f"{name}.mkv", [page(height=size[0], width=size[1])], codec="mjpeg", pix_fmt="yuvj420p")
+    with open_media(tmp_path / "both.mkv", "w") as target:
         for k, name in enumerate("ab"):
-            with media_file(tmp_path / f"{name}.mkv") as source:
+            with open_media(tmp_path / f"{name}.mkv") as source:
                 stream = target.streams.video[0] if k else target.add_stream_from_template(source.streams.video[0])
                 packet = next(source.demux(video=0))
                 packet.stream, packet.pts, packet.dts = stream, 40 * k, 40 * k
@@ -406,15 +328,10 @@ def test_frames_that_change_their_size_raise(tmp_path):
         convert_video(tmp_path / "both.mkv", tmp_path / "c.mp4", change=unchanged)
 
 
-def test_a_full_disk_raises(tmp_path):
+def test_a_full_disk_raises(tmp_path, file_limit):
     pages = [np.random.default_rng(k).integers(0, 256, (64, 96, 3), np.uint8) for k in range(40)]
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            write_video(pages, tmp_path / "a.mp4", fps=10, size=(96, 64))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with file_limit(100_000), pytest.raises(OSError, match="File too large"):
+        write_video(pages, tmp_path / "a.mp4", fps=10, size=(96, 64))
 
 
 def test_the_delays_of_a_gif_are_kept_up_to_the_last_one(tmp_path):
@@ -422,13 +339,13 @@ def test_the_delays_of_a_gif_are_kept_up_to_the_last_one(tmp_path):
     images[0].save(tmp_path / "a.gif", save_all=True, append_images=images[1:], duration=[50, 700, 90])
     convert_video(tmp_path / "a.gif", tmp_path / "b.mp4", change=unchanged)
     assert times_of(tmp_path / "b.mp4") == pytest.approx([0, 0.05, 0.75], abs=1e-3)
-    with media_file(tmp_path / "b.mp4") as container:
+    with open_media(tmp_path / "b.mp4") as container:
         assert container.duration == pytest.approx(840_000, abs=1000)  # microseconds
     assert is_complete(tmp_path / "a.gif", tmp_path / "b.mp4")
 
 
 def test_a_video_without_a_number_of_frames_in_its_header_is_counted(tmp_path):
-    write(tmp_path / "a.mkv", [page(k) for k in range(8)], times=TIMES_MS)
+    save_media(tmp_path / "a.mkv", [page(k) for k in range(8)], times=TIMES_MS)
     assert video_info(tmp_path / "a.mkv")[0] == 8
     assert write_video([page()] * 5, tmp_path / "b.mp4", fps=29.97, size=(48, 32)) == 5
     assert video_info(tmp_path / "b.mp4") == (5, pytest.approx(29.97, rel=1e-6))

@@ -1,12 +1,8 @@
 """Sources and outputs of `degrade`, and frames of `train`, in object stores: as on disk, also after a kill."""
 
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from fsspec.implementations.memory import MemoryFileSystem
+from processes import running, wait_for
+from stores import digests, failing_writes
 from torch.utils.data import DataLoader
 
 from torchrefract._io import as_path
@@ -22,7 +20,6 @@ from torchrefract.data.media import write_video
 from torchrefract.data.module import fingerprint
 from torchrefract.data.pairs import PairedFolder
 
-ROOT = Path(__file__).parents[2]
 WORDS = ("scene=paper_refractive", "workers=0")
 NAMES = ("drive0/a [1].png", "drive0/b.png", "drive1/c.png", "d.mp4")
 
@@ -46,15 +43,9 @@ def stored(memory, raw) -> MemoryFileSystem:
     return memory
 
 
-def content(store: Any, root: str) -> dict[str, bytes]:
-    """Return the files in a folder of a store but for the settings, which name the source."""
-    files = {path.split(root)[1].lstrip("/"): store.cat_file(path) for path in store.find(root)}
-    return {name: data for name, data in files.items() if name != "config.json"}
-
-
-def content_on_disk(folder: Path) -> dict[str, bytes]:
-    files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in files.items() if name != "config.json"}
+def results(folder: str | Path) -> dict[str, str]:
+    """Return the checksums of the files in a folder but for the settings, which name the source."""
+    return {name: data for name, data in digests(folder).items() if name != "config.json"}
 
 
 @pytest.mark.parametrize("maps", ["false", "true"])
@@ -64,7 +55,7 @@ def test_pictures_and_videos_in_a_store_are_degraded_as_on_disk(call, stored, tm
     assert outcome.out.startswith("memory://out: 4 degraded, 0 already existed, 0 skipped")
     assert call("degrade", *WORDS, f"maps={maps}", "source=raw", "out=out").code == 0
     assert call("degrade", *WORDS, f"maps={maps}", "source=memory://raw", "out=mixed").code == 0
-    assert content(stored, "/out") == content_on_disk(tmp_path / "out") == content_on_disk(tmp_path / "mixed")
+    assert results("memory://out") == results(tmp_path / "out") == results(tmp_path / "mixed")
     for out in ("memory://out", "mixed"):
         outcome = call("degrade", *WORDS, f"maps={maps}", "source=memory://raw", f"out={out}")
         assert outcome.out.startswith(f"{out}: 0 degraded, 4 already existed, 0 skipped")
@@ -72,21 +63,13 @@ def test_pictures_and_videos_in_a_store_are_degraded_as_on_disk(call, stored, tm
     assert message.startswith("out must be a folder of the same configuration, got memory://out, where seed is 0 there")
 
 
-def test_a_stopped_run_of_degrade_in_a_store_continues(call, stored, tmp_path, monkeypatch):
-    put = stored.put_file
-
-    def stop(source: str, target: str, **more: Any) -> None:
-        if target.endswith("b.png"):
-            raise KeyboardInterrupt
-        put(source, target, **more)
-
+def test_a_stopped_run_of_degrade_in_a_store_continues(call, stored, tmp_path):
     words = (*WORDS, "source=memory://raw", "out=memory://out")
-    with monkeypatch.context() as patch:
-        patch.setattr(MemoryFileSystem, "put_file", lambda _, *names, **more: stop(*names, **more))
+    with failing_writes(KeyboardInterrupt(), suffix="b.png"):
         assert call("degrade", *words).code == 130
     assert call("degrade", *words).out.startswith("memory://out: 2 degraded, 2 already existed, 0 skipped")
     assert call("degrade", *WORDS, "source=raw", "out=out").code == 0
-    assert content(stored, "/out") == content_on_disk(tmp_path / "out")
+    assert results("memory://out") == results(tmp_path / "out")
 
 
 def test_a_file_that_vanishes_from_a_store_is_named_and_degraded_by_the_next_run(call, stored, monkeypatch):
@@ -106,16 +89,9 @@ def test_a_file_that_vanishes_from_a_store_is_named_and_degraded_by_the_next_run
     assert call("degrade", *words).out.startswith("memory://out: 1 degraded, 3 already existed, 0 skipped")
 
 
-def test_a_store_that_denies_writing_is_one_line_of_degrade(call, stored, monkeypatch):
-    put = stored.put_file
-
-    def deny(source: str, target: str, **more: Any) -> None:
-        if target.endswith(".png"):
-            raise PermissionError("Access Denied")
-        put(source, target, **more)
-
-    monkeypatch.setattr(MemoryFileSystem, "put_file", lambda _, *names, **more: deny(*names, **more))
-    message = call("degrade", *WORDS, "source=memory://raw", "out=memory://out").message
+def test_a_store_that_denies_writing_is_one_line_of_degrade(call, stored):
+    with failing_writes(PermissionError("Access Denied"), suffix=".png"):
+        message = call("degrade", *WORDS, "source=memory://raw", "out=memory://out").message
     assert message == "out must be a folder that can be written to, got memory://out (Permission denied)"
 
 
@@ -139,22 +115,19 @@ def test_an_invalid_address_of_degrade_is_one_line(call, stored, tmp_path, words
 def test_a_run_of_degrade_in_a_bucket_that_is_killed_continues_to_the_bytes_on_disk(
     call, frames, tmp_path, request, protocol
 ):
-    server, bucket = request.getfixturevalue(protocol), f"{protocol}://bucket"
+    request.getfixturevalue(protocol)
+    bucket = f"{protocol}://bucket"
     store: Any = as_path(bucket)
     store.fs.put(str(frames), "bucket/raw", recursive=True)
     words = ("scene=paper_refractive", f"source={bucket}/raw", f"out={bucket}/fog", "workers=1")
-    command = [sys.executable, "-m", "torchrefract.degrade", *words]
-    with subprocess.Popen(command, env=os.environ | server | {"PYTHONPATH": str(ROOT)}) as run:
-        end = time.monotonic() + 120
-        while run.poll() is None and time.monotonic() < end and not store.fs.glob("bucket/fog/drive0/*"):
-            time.sleep(0.02)
-        run.send_signal(signal.SIGKILL)
+    with running("-m", "torchrefract.degrade", *words) as run:
+        wait_for(lambda: store.fs.glob("bucket/fog/drive0/*"), run)
     assert run.returncode == -signal.SIGKILL
     outcome = call("degrade", *words, "workers=0")
     assert outcome.code == 0
     assert "0 already existed" not in outcome.out
     assert call("degrade", *WORDS, f"source={frames}", "out=fog").code == 0
-    assert content(store.fs, "bucket/fog") == content_on_disk(tmp_path / "fog")
+    assert results(f"{bucket}/fog") == results(tmp_path / "fog")
 
 
 def test_frames_in_a_store_are_those_on_disk(memory, frames):

@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import assert_close_maps, maps_of, random_image
+from helpers import assert_close_maps, maps_of, random_image, seeded
 from torch import Tensor
 from torch.testing import assert_close
+from torchvision import tv_tensors
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
@@ -81,28 +82,22 @@ def test_params_repeat_a_clip_and_each_of_its_frames(effect):
 
 
 def test_a_video_of_torchvision_is_one_clip():
-    tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
     effect, clip = EFFECTS["compose"], random_image(4, 3, 20, 30, dtype=torch.uint8)
     video = tv_tensors.Video(clip)
     expected = maps_of(effect.degrade(clip[None], seed=7))
     assert_close_maps(
         maps_of(effect.degrade(video, seed=7, keys=[0])), {name: value[0] for name, value in expected.items()}
     )
-    torch.manual_seed(3)
-    result = effect(video)
-    torch.manual_seed(3)
+    result = seeded(effect, video)
     assert type(result) is tv_tensors.Video
-    assert torch.equal(result.as_subclass(Tensor), effect(clip[None])[0])
+    assert torch.equal(result.as_subclass(Tensor), seeded(effect, clip[None])[0])
 
 
 def test_masks_of_a_video_move_frame_by_frame():
-    tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
     effect, clip = EFFECTS["turbulence"], random_image(4, 3, 20, 30)
     mask = (random_image(4, 20, 30) > 0.5).long()
-    torch.manual_seed(3)
-    _, target = effect(tv_tensors.Video(clip), {"masks": tv_tensors.Mask(mask)})
-    torch.manual_seed(3)
-    flow = effect.degrade(clip[None]).flow[0]
+    _, target = seeded(effect, tv_tensors.Video(clip), {"masks": tv_tensors.Mask(mask)})
+    flow = seeded(effect.degrade, clip[None]).flow[0]
     assert torch.equal(target["masks"].as_subclass(Tensor), tr.warp_mask(mask[:, None], flow)[:, 0])
     assert not torch.equal(target["masks"].as_subclass(Tensor), mask)
 

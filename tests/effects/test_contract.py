@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from domain import IGNORE_STRENGTH
-from helpers import DTYPES, assert_close_maps, assert_equal_maps, maps_of, random_image
+from helpers import DTYPES, assert_close_maps, assert_equal_maps, assert_graph_agrees, maps_of, random_image
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils.data import DataLoader, Dataset
@@ -590,11 +590,7 @@ def test_one_graph_gives_the_same_as_eager_mode(name):
     effect, image = EFFECTS[name].strong(p=0.8, **options), random_image(3, 3, 24, 32)
     # To lower a graph takes as long as to trace it and tests PyTorch: one warp and one photometric effect are lowered.
     backend = "inductor" if name in ("thin-plate spline", "uniform fog") else "eager"
-    torch.manual_seed(3)
-    expected = [effect(image) for _ in range(2)]
-    compiled = torch.compile(effect, fullgraph=True, backend=backend)
-    torch.manual_seed(3)
-    assert_close([compiled(image) for _ in range(2)], expected, rtol=0, atol=2e-4)
+    assert_graph_agrees(effect, image, backend=backend)
 
 
 def test_nan_or_infinity_in_a_field_of_the_params_raises(case):

@@ -8,11 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import EFFECTS, SIZE, maps_of, random_image
+from helpers import EFFECTS, SIZE, maps_of, random_image, seeded
+from targets import boxes_of
 from torch import Tensor, nn
 from torch.testing import assert_close
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader
+from torchvision import tv_tensors
+from torchvision.transforms import v2
 
 import torchrefract as tr
 from torchrefract.effects.base import Effect
@@ -28,36 +31,23 @@ def random_frames(*shape: int) -> Tensor:
     return random_image(*shape, *SIZE)
 
 
-@pytest.fixture(scope="session")
-def v2() -> Any:
-    return pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
-
-
-@pytest.fixture(scope="session")
-def tv_tensors() -> Any:
-    return pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
-
-
-def test_an_effect_moves_the_target_between_transforms_of_torchvision_v2(effect, v2, tv_tensors):
+def test_an_effect_moves_the_target_between_transforms_of_torchvision_v2(effect):
     image = tv_tensors.Image((255 * random_frames(3)).byte())
     target = {
-        "boxes": tv_tensors.BoundingBoxes(torch.tensor([[9.0, 8.0, 30.0, 25.0]]), format="XYXY", canvas_size=SIZE),
+        "boxes": boxes_of([[9.0, 8.0, 30.0, 25.0]], SIZE),
         "masks": tv_tensors.Mask(random_frames(1) > 0.5),
         "labels": torch.tensor([4]),
     }
     before, after = v2.RandomHorizontalFlip(p=1.0), v2.ToDtype(torch.float32, scale=True)
-    torch.manual_seed(3)
-    result, moved = v2.Compose([before, effect, after])(image, target)
-    torch.manual_seed(3)
-    expected, boxes = after(*effect(*before(image, target)))
+    result, moved = seeded(v2.Compose([before, effect, after]), image, target)
+    expected, boxes = seeded(lambda *sample: after(*effect(*before(*sample))), image, target)
     assert type(result) is tv_tensors.Image
     assert torch.equal(result, expected)
     assert moved.keys() == target.keys()
     for name, value in moved.items():
         assert type(value) is type(target[name])
         assert torch.equal(value, boxes[name]), name
-    torch.manual_seed(3)
-    before(image, target)
+    seeded(before, image, target)
     flow = effect.degrade(image.flip(-1)).flow
     mirrored = torch.tensor([[SIZE[1] - 30.0, 8.0, SIZE[1] - 9.0, 25.0]])
     if flow is not None:
@@ -72,10 +62,7 @@ def test_an_effect_works_between_augmentations_of_kornia(effect, name):
     flip, scale = augmentation.RandomHorizontalFlip(p=1.0), augmentation.Normalize(0.5, 0.5)
     pipeline = getattr(augmentation.container, name)(flip, effect, scale, **options)
     image = random_frames(3, 3)
-    torch.manual_seed(3)
-    result = pipeline(image)
-    torch.manual_seed(3)
-    flipped = flip(image)
+    result, flipped = seeded(pipeline, image), seeded(flip, image)
     assert torch.equal(flipped, image.flip(-1))
     assert torch.equal(result, scale(effect(flipped)))
 
@@ -180,10 +167,8 @@ def test_maps_that_are_read_inside_autocast_are_those_outside(dtype):
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
 def test_a_copy_of_a_model_degrades_like_the_model(effect, copied):
     model, image = nn.Sequential(nn.Conv2d(3, 3, 1), effect), random_frames(3, 3)
-    torch.manual_seed(3)
-    expected = model(image)
-    torch.manual_seed(3)
-    assert torch.equal(copied(model)(image), expected)
+    expected = seeded(model, image)
+    assert torch.equal(seeded(copied(model), image), expected)
 
 
 def test_an_effect_adds_nothing_to_the_state_of_a_model(effect):
@@ -192,7 +177,4 @@ def test_an_effect_adds_nothing_to_the_state_of_a_model(effect):
     other = nn.Sequential(nn.Conv2d(3, 3, 1), copy.deepcopy(effect))
     other.load_state_dict(model.state_dict(), strict=True)
     image = random_frames(3, 3)
-    torch.manual_seed(3)
-    expected = model(image)
-    torch.manual_seed(3)
-    assert torch.equal(other(image), expected)
+    assert torch.equal(seeded(other, image), seeded(model, image))

@@ -193,21 +193,22 @@ def test_the_parameters_alone_decide_whether_the_density_is_even():
     assert torch.equal(even.apply(image, thick).image, even.apply(image, thick._replace(scale_height=None)).image)
 
 
+# An even fog of one visibility before a level camera, which ends after 30 m.
+EVEN: dict[str, Any] = {"visibility_range": (50.0, 50.0), "deviation_range": NO_RANGE, "contrast_range": NO_RANGE}
+EVEN |= {"camera": Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)}
+EVEN |= {"mode": "ray", "horizon": 0.5}
+BLACK, AT_30_M = torch.zeros(1, 3, 40, 60).double(), torch.full((1, 1, 40, 60), 30.0).double()
+
+
+def ray_of(row: int, column: int) -> Tensor:
+    return torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)
+
+
 def test_the_transmission_of_dust_is_that_of_its_optical_depth():
-    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), 30.0, dtype=torch.float64)
-    camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)
-    effect = HeterogeneousFog(
-        mode="ray",
-        camera=camera,
-        horizon=0.5,
-        visibility_range=(50.0, 50.0),
-        deviation_range=(0.0, 0.0),
-        contrast_range=(0.0, 0.0),
-        scale_height_range=(1.5, 1.5),
-    )
-    t = effect.degrade(image, seed=7, depth=depth).transmission[0, 0]
+    effect = HeterogeneousFog(**EVEN, scale_height_range=(1.5, 1.5))
+    t = effect.degrade(BLACK, seed=7, depth=AT_30_M).transmission[0, 0]
     for row, column in ((3, 7), (19, 30), (20, 50)):
-        ray = torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)
+        ray = ray_of(row, column)
         share = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
         height = 1.3 - 30 * ray[1] * share
         expected = torch.exp(math.log(0.05) / 50 * 30 * ray.norm() * torch.exp(-height / 1.5).mean())
@@ -250,15 +251,12 @@ def test_the_dust_behind_vehicles_follows_their_boxes_over_a_clip():
 
 
 def test_the_optical_depth_behind_a_vehicle_is_that_along_its_rays():
-    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), 30.0, dtype=torch.float64)
-    camera = Camera(width=60, height=40, fx=50.0, fy=50.0, cx=29.5, cy=19.5, coefficients=(0.0,) * 4)
-    exact: dict[str, Any] = {"visibility_range": (50.0, 50.0), "deviation_range": NO_RANGE, "contrast_range": NO_RANGE}
-    effect = HeterogeneousFog(mode="ray", camera=camera, horizon=0.5, wake_density=6.0, wake_length=4.0, **exact)
-    params = effect.sample(image, seed=7)._replace(vehicles=torch.tensor([[[22.0, 14.0, 34.0, 22.0]]]))
-    t = effect.apply(image, params, depth=depth).transmission[0, 0]
+    effect = HeterogeneousFog(**EVEN, wake_density=6.0, wake_length=4.0)
+    params = effect.sample(BLACK, seed=7)._replace(vehicles=torch.tensor([[[22.0, 14.0, 34.0, 22.0]]]))
+    t = effect.apply(BLACK, params, depth=AT_30_M).transmission[0, 0]
     place, high = 1.3 * 50 / 2.5, 1.3 * 8 / 2.5  # m: the lower edge lies 2.5 px below the horizon
     for row, column in ((5, 28), (19, 20), (21, 30)):
-        ray = torch.tensor([(column - 29.5) / 50, (row - 19.5) / 50, 1.0], dtype=torch.float64)
+        ray = ray_of(row, column)
         z = 30 * (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
         wake = torch.exp(-(1.3 - z * ray[1]) / high - (place - z) / 4) * (z <= place)
         wake = 6 * math.exp(-2 * ((column - 28) / 12) ** 2) * wake
@@ -282,18 +280,12 @@ def test_invalid_vehicles_raise():
 
 
 def test_fog_is_brighter_on_the_side_of_the_sun_by_henyey_and_greensteins_phase_function():
-    image, depth = torch.zeros(1, 3, 40, 60, dtype=torch.float64), torch.full((1, 1, 40, 60), math.inf)
     camera = Camera(width=60, height=40, fx=50.0, fy=45.0, cx=31.0, cy=18.0, coefficients=(0.0,) * 4)
-    effect = HeterogeneousFog(
-        camera=camera,
-        horizon=0.6,
-        airlight=(0.5, 0.4, 0.3),
-        sunlight_range=(0.2, 0.2),
-        sun_azimuth_range=(35.0, 35.0),
-        sun_elevation_range=(12.0, 12.0),
-        asymmetry=0.6,
+    sun: dict[str, Any] = {"sun_azimuth_range": (35.0, 35.0), "sun_elevation_range": (12.0, 12.0), "asymmetry": 0.6}
+    sun |= {"sunlight_range": (0.2, 0.2), "airlight": (0.5, 0.4, 0.3)}
+    degraded = HeterogeneousFog(camera=camera, horizon=0.6, **sun).degrade(
+        BLACK, seed=3, depth=torch.full_like(AT_30_M, math.inf)
     )
-    degraded = effect.degrade(image, seed=3, depth=depth)
     # In coordinates of the road: x to the right, y down, z ahead; the camera looks up, for its horizon is low.
     pitch = Rotation.from_euler("x", math.atan((0.6 * 40 - 0.5 - 18) / 45)).as_matrix()
     to_sun = Rotation.from_euler("xy", [12.0, 35.0], degrees=True).as_matrix() @ [0, 0, 1]

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from torchvision import tv_tensors
 
 from torchrefract import Compose, LensDistortion, LensFlare, UniformFog
 from torchrefract.effects.batch import check_image_values
@@ -104,9 +106,8 @@ def test_other_layouts_and_types_raise(image, error, message):
 
 
 def test_labels_in_the_place_of_the_image_raise():
-    tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra train")
     mask = tv_tensors.Mask(torch.zeros(1, 48, 60, dtype=torch.uint8))
-    points = tv_tensors.KeyPoints(torch.rand(1, 3, 2), canvas_size=(48, 60))
+    points = tv_tensors.KeyPoints(torch.rand(1, 3, 2), canvas_size=(48, 60))  # pyright: ignore[reportCallIssue]  # torchvision's overloads
     for label in (mask, points):
         with pytest.raises(
             TypeError, match=rf"image must be an image, got {type(label).__name__} of torchvision; pass"
@@ -117,7 +118,7 @@ def test_labels_in_the_place_of_the_image_raise():
 
 
 def test_a_picture_of_pillow_raises():
-    picture = pytest.importorskip("PIL.Image", reason="pillow is in the extra train").new("RGB", (60, 48))
+    picture = Image.new("RGB", (60, 48))
     for inputs in ((picture,), (picture, {}), ({"image": picture, "labels": torch.arange(2)},)):
         with pytest.raises(TypeError, match=r"image must be a tensor, got PIL\.Image\.Image; .* place v2\.ToImage\(\)"):
             LensDistortion()(*inputs)

@@ -5,15 +5,16 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import seeded
+from targets import boxes_of
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
+from torchvision import tv_tensors
+from torchvision.transforms import v2
 
 from torchrefract import Compose, LensDistortion, ThinPlateSpline, Turbulence, UniformFog, warp_points
 from torchrefract.effects.base import Effect
 from torchrefract.warping.lattice import LatticeFlow
-
-tv_tensors = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is in the extra test")
-v2 = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is in the extra test")
 
 EFFECTS = [LensDistortion(), Turbulence(), ThinPlateSpline(), Compose([Turbulence(), UniformFog(), LensDistortion()])]
 
@@ -26,7 +27,7 @@ def sample() -> tuple[Tensor, dict]:
     mask[1, 5:15, 60:80] = 1
     boxes = torch.tensor([[30.0, 20.0, 50.0, 40.0], [60.0, 5.0, 80.0, 15.0]])
     target = {
-        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", canvas_size=size),  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+        "boxes": boxes_of(boxes, size),
         "masks": tv_tensors.Mask(mask),
         "points": tv_tensors.KeyPoints(torch.tensor([[40.0, 30.0], [70.0, 10.0]]), canvas_size=size),  # pyright: ignore[reportCallIssue]  # as above
         "labels": torch.tensor([3, 7]),
@@ -45,10 +46,8 @@ def moved_samples(effect: Effect, images: Tensor, seed: int) -> list[bool]:
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: type(effect).__name__)
 def test_labels_move_with_the_image(effect: Effect):
     image, target = sample()
-    torch.manual_seed(4)
-    expected = effect.degrade(image)
-    torch.manual_seed(4)
-    result, moved = effect(image, target)
+    expected = seeded(effect.degrade, image)
+    result, moved = seeded(effect, image, target)
     assert torch.equal(result, expected.image)
     points, _ = warp_points(target["points"].as_subclass(Tensor), expected.flow)
     assert torch.allclose(moved["points"].as_subclass(Tensor), points, atol=1e-4)
@@ -63,9 +62,7 @@ def test_labels_move_with_the_image(effect: Effect):
 
 def test_labels_of_an_image_that_does_not_move_are_not_clipped():
     image = torch.rand(3, 40, 56)
-    outside = tv_tensors.BoundingBoxes(
-        torch.tensor([[-5.0, -5, 20, 20], [60, 5, 70, 9]]), format="XYXY", canvas_size=(40, 56)
-    )  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+    outside = boxes_of([[-5.0, -5, 20, 20], [60, 5, 70, 9]], (40, 56))
     second = tv_tensors.Image(torch.rand(3, 40, 56))
     target = {"boxes": outside, "labels": torch.arange(2), "second": second}
     _, unmoved = LensDistortion(p=0.0)(image, target)
@@ -82,7 +79,7 @@ def test_labels_of_a_sample_that_does_not_move_are_not_clipped_in_a_mixed_batch(
     size: dict[str, Any] = {"canvas_size": (40, 56)}
     points = torch.tensor([[-3.0, -2.0], [20.0, 10.0]])
     sample = {
-        "boxes": tv_tensors.BoundingBoxes(torch.tensor([[-5.0, -5, 20, 20], [80, 5, 90, 9]]), format="XYXY", **size),
+        "boxes": boxes_of([[-5.0, -5, 20, 20], [80, 5, 90, 9]], (40, 56)),
         "labels": torch.arange(2),
         "points": tv_tensors.KeyPoints(points, **size),
         "visible": torch.ones(2),
@@ -123,10 +120,9 @@ def test_an_unknown_type_of_label_raises():
 def border_sample() -> dict[str, Any]:
     """Return a sample of two boxes, of which the one in the corner leaves the frame under PINCUSHION."""
     size: dict[str, Any] = {"canvas_size": (64, 80)}
-    boxes = torch.tensor([[0.0, 0, 3, 3], [30, 30, 50, 50]])
     return {
         "image": tv_tensors.Image(torch.rand(3, 64, 80)),
-        "boxes": tv_tensors.BoundingBoxes(boxes, format="XYXY", **size),
+        "boxes": boxes_of([[0.0, 0, 3, 3], [30, 30, 50, 50]], (64, 80)),
         "labels": torch.tensor([1, 2]),
         "keypoints": tv_tensors.KeyPoints(torch.rand(2, 17, 2) * 20 + 30, **size),
     }

@@ -1,6 +1,8 @@
 """Turbulence by its physics, against quadrature and the correlations of Kolmogorov's spectrum."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from torchrefract import Camera, Compose, GroundPlaneDepth, LensDistortion, Phys
 from torchrefract.fields import physical_turbulence
 from torchrefract.fields.physical_turbulence import (
     Air,
+    Layers,
     fried_parameter,
     height_gain,
     layer_gradients,
@@ -70,20 +73,17 @@ def with_random_phases(monkeypatch):
     monkeypatch.setattr(physical_turbulence, "white_noise", phases)
 
 
+def drawn_gradients(key: Tensor, layers: Layers, *, focal: float, side: int, shift: Tensor | None = None) -> list:
+    """Return the gradients of each layer in a square frame."""
+    frame = {"size": (side, side), "rows": range(side), "columns": range(side), "dtype": torch.float64}
+    return list(layer_gradients(key, layers, focal=(focal, focal), shift=shift, **frame))
+
+
 def covariance(air: Air, *, focal: float, distance: float, num_layers: int) -> tuple[Tensor, Tensor]:
     """Return the covariance of two rays along and across their separation in px, relative to the theory's variance."""
-    layers, whole = layers_of(distance, num_layers, air), range(SIDE)
+    layers = layers_of(distance, num_layers, air)
     shares = layer_shares(torch.tensor([distance], dtype=torch.float64), layers)
-    drawn = layer_gradients(
-        torch.zeros(1, 4, dtype=torch.int64),
-        layers,
-        focal=(focal, focal),
-        size=(SIDE, SIDE),
-        rows=whole,
-        columns=whole,
-        shift=None,
-        dtype=torch.float64,
-    )
+    drawn = drawn_gradients(torch.zeros(1, 4, dtype=torch.int64), layers, focal=focal, side=SIDE)
     total = [torch.zeros(SIDE, dtype=torch.float64)] * 2
     for share, gradient in zip(shares, drawn, strict=True):
         power = [torch.fft.fft(part[0, 0], dim=1).abs().square().mean(dim=0) / SIDE**2 for part in gradient]
@@ -133,9 +133,8 @@ def test_the_field_has_no_curl():
 def test_the_displacement_grows_with_the_root_of_distance_and_not_with_the_number_of_layers():
     depths = np.geomspace(30.0, 1000.0, 7)
     for num_layers in (3, 4, 8):
-        effect = PhysicalTurbulence(
-            cn2_range=(1e-11, 1e-11), height=None, num_layers=num_layers, reach=1000.0, tolerance_px=None
-        )
+        air: dict[str, Any] = {"cn2_range": (1e-11, 1e-11), "height": None, "reach": 1000.0}
+        effect = PhysicalTurbulence(**air, num_layers=num_layers, tolerance_px=None)
         image = torch.zeros(24, 1, 60, 96)
         spread = [
             effect.degrade(image, seed=2, depth=torch.full_like(image, d)).flow.square().mean().sqrt().item()
@@ -187,24 +186,10 @@ def test_the_wind_carries_each_layer():
     layers, side, focal = layers_of(100.0, 3, Air(0.05, 0.01, 5.0)), 32, 900.0
     key = torch.tensor([[1, 2, 3, 4]])
 
-    def drawn(shift: Tensor | None) -> list[list[Tensor]]:
-        whole, size = range(side), (side, side)
-        return list(
-            layer_gradients(
-                key,
-                layers,
-                focal=(focal, focal),
-                size=size,
-                rows=whole,
-                columns=whole,
-                shift=shift,
-                dtype=torch.float64,
-            )
-        )
-
-    still = drawn(None)
+    still = drawn_gradients(key, layers, focal=focal, side=side)
     for k, distance in enumerate(layers.distances):
-        moved = drawn(torch.tensor([[5.0, -3.0]], dtype=torch.float64) * distance / focal)  # px in this layer
+        shift = torch.tensor([[5.0, -3.0]], dtype=torch.float64) * distance / focal  # px in this layer
+        moved = drawn_gradients(key, layers, focal=focal, side=side, shift=shift)
         for component in (0, 1):
             assert_close(moved[k][component], still[k][component].roll((-3, 5), (2, 3)), rtol=0, atol=1e-5)
 
@@ -237,14 +222,8 @@ def test_cn2_and_displacements_convert_into_each_other():
     for cn2, distance, px in ((1e-12, 200.0, 0.0465), (1e-11, 300.0, 0.1802)):
         effect = Turbulence.from_physics(cn2, camera=camera)
         assert effect.equivalent_amplitude(1920, distance=distance)[0] == pytest.approx(px, rel=1e-3)
-    long = PhysicalTurbulence(
-        cn2_range=(1e-12, 1e-12),
-        camera=Camera(width=1920, height=1080, fx=8570, fy=8570, cx=960, cy=540, coefficients=(0.0,) * 5),
-        aperture=0.025,
-        inner_scale=1e-3,
-        outer_scale=1e4,
-        reach=2000.0,
-    )
+    air: dict[str, Any] = {"aperture": 0.025, "inner_scale": 1e-3, "outer_scale": 1e4, "reach": 2000.0}
+    long = PhysicalTurbulence(cn2_range=(1e-12, 1e-12), camera=replace(camera, fx=8570, fy=8570), **air)
     assert long.equivalent_amplitude(1920)[0] == pytest.approx(0.73, abs=0.01)
     haze = Turbulence(amplitude_range=(0.4, 1.2), reference_distance=150.0)
     cn2_range = haze.equivalent_cn2(camera)

@@ -10,9 +10,9 @@ import torch
 from helpers import random_image
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
+from targets import boxes_of
 from torch import Tensor, nn
 from torch.testing import assert_close
-from torchvision import tv_tensors
 
 from torchrefract import (
     Camera,
@@ -35,15 +35,7 @@ CAMERA = Camera(width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL, cx=121.0, cy=60.
 
 def driving(speed: float, readout: float, **given: float) -> RollingShutterParams:
     """Return the parameters of one camera, by default without vibration; pitch, yaw, roll in deg and one frequency."""
-    values = {
-        "exposure": 0.0,
-        "pitch": 0.0,
-        "yaw": 0.0,
-        "roll": 0.0,
-        "frequency": 15.0,
-        "phase": 0.0,
-        "frame": 0.0,
-    } | given
+    values = dict.fromkeys(("exposure", "pitch", "yaw", "roll", "phase", "frame"), 0.0) | {"frequency": 15.0} | given
 
     def tensor(*numbers: float) -> Tensor:
         return torch.tensor([numbers], dtype=torch.float64)
@@ -243,10 +235,7 @@ def test_the_vibration_of_a_clip_goes_on_from_frame_to_frame():
 
 def test_labels_move_along_and_in_a_composition_the_scene_is_sampled_once():
     image = torch.rand(3, HEIGHT, WIDTH)
-    corners = torch.tensor([[190, 20, 200, 110]])
-    boxes = tv_tensors.BoundingBoxes(  # pyright: ignore[reportCallIssue]  # torchvision's overloads
-        corners, format="XYXY", canvas_size=(HEIGHT, WIDTH)
-    )
+    boxes = boxes_of([[190, 20, 200, 110]], (HEIGHT, WIDTH))
     effect = RollingShutter(speed_range=(100.0, 100.0), readout_range=(30.0, 30.0), depth=Plane(8.0), **STILL)
     moved = effect(image, {"boxes": boxes, "labels": torch.tensor([1])})[1]["boxes"]
     # The upper left and the lower right corner, relative to the center of the frame, grow by 1 / (1 - v t / Z).

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from helpers import EFFECTS, SIZE, assert_equal_maps, maps_of, random_image
+from helpers import EFFECTS, SIZE, assert_equal_maps, maps_of, random_image, seeded
 from torch import Tensor, nn
 from torch._dynamo.exc import FailOnRecompileLimitHit
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -79,13 +79,13 @@ def test_the_default_type_changes_no_bit_of_moved_labels(default_type):
 
 def test_the_default_device_changes_nothing(effect):
     image = random_image(2, 3, *SIZE)
-    torch.manual_seed(3)
-    expected = [maps_of(effect.degrade(image, seed=7, keys=[5, 9])), {"image": effect(image)}]
-    torch.manual_seed(3)
+
+    def results() -> dict[str, Tensor]:
+        return maps_of(effect.degrade(image, seed=7, keys=[5, 9])) | {"drawn": effect(image)}
+
+    expected = seeded(results)
     with torch.device("meta"):
-        actual = [maps_of(effect.degrade(image, seed=7, keys=[5, 9])), {"image": effect(image)}]
-    for value, other in zip(actual, expected, strict=True):
-        assert_equal_maps(value, other)
+        assert_equal_maps(seeded(results), expected)
 
 
 # `torch.compile` runs each effect on fake tensors in its own test; one of each kind suffices outside of a graph.
@@ -120,10 +120,7 @@ def test_a_graph_takes_another_frame_size_and_batch():
     compiled = torch.compile(effect, fullgraph=True, backend=lambda graph, _: graphs.append(graph) or graph.forward)
     for shape in ((2, 3, 24, 32), (3, 3, 20, 28), (3, 3, 24, 32), (2, 3, 24, 32)):
         image = random_image(*shape)
-        torch.manual_seed(3)
-        expected = effect(image)
-        torch.manual_seed(3)
-        assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+        assert_close(seeded(compiled, image), seeded(effect, image), rtol=0, atol=2e-4)
     assert len(graphs) == 3
 
 
@@ -134,10 +131,7 @@ def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch(
         compiled = torch.compile(effect, fullgraph=True, backend="eager")
         with torch._dynamo.config.patch(recompile_limit=limit):
             for image in images[:limit]:
-                torch.manual_seed(3)
-                expected = effect(image)
-                torch.manual_seed(3)
-                assert_close(compiled(image), expected, rtol=0, atol=2e-4)
+                assert_close(seeded(compiled, image), seeded(effect, image), rtol=0, atol=2e-4)
             if limit < len(images):
                 with pytest.raises(FailOnRecompileLimitHit):
                     compiled(images[limit])
@@ -150,10 +144,7 @@ def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws(effect):
     torch.export.save(torch.export.export(model, (image,)), file)
     file.seek(0)
     exported = torch.export.load(file).module()
-    torch.manual_seed(3)
-    expected = model(image)
-    torch.manual_seed(3)
-    first = exported(image)
+    expected, first = seeded(model, image), seeded(exported, image)
     assert_close(first, expected, rtol=0, atol=2e-4)
     assert (exported(image) - first).abs().max() > 0.01
 

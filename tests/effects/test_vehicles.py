@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from targets import boxes_of
 from torch.testing import assert_close
 from torchvision import tv_tensors
 
@@ -15,7 +16,7 @@ CAR, PERSON = [20.0, 14.0, 31.0, 23.0], [40.0, 14.0, 44.0, 30.0]
 
 
 def boxes(*rows: list[float]) -> tv_tensors.BoundingBoxes:
-    return tv_tensors.BoundingBoxes(torch.tensor(rows), format="XYXY", canvas_size=(40, 60))  # pyright: ignore[reportCallIssue]  # as torchvision's own examples
+    return boxes_of(rows, (40, 60))
 
 
 def degraded(effect: Any, *target: Any, image: torch.Tensor | None = None) -> torch.Tensor:
@@ -102,7 +103,7 @@ def test_dust_in_a_composition_takes_the_boxes_and_the_labels_move_along():
 @pytest.mark.quick
 def test_boxes_of_every_format_are_upright_boxes_from_the_center_of_the_first_pixel():
     for form, row in (("XYWH", [20.0, 14.0, 11.0, 9.0]), ("XYXYXYXY", [20.0, 14, 31, 14, 31, 23, 20, 23])):
-        target = tv_tensors.BoundingBoxes(torch.tensor([row]), format=form, canvas_size=(40, 60))  # pyright: ignore[reportCallIssue]  # as above
+        target = tv_tensors.BoundingBoxes(torch.tensor([row]), format=form, canvas_size=(40, 60))  # pyright: ignore[reportCallIssue]  # torchvision's overloads
         assert_close(boxes_of_target([target], size=(40, 60)).boxes, torch.tensor([CAR]) - 0.5, rtol=0, atol=1e-5)
 
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,6 +64,12 @@ def maps_of(degraded: tr.Degraded) -> dict[str, Tensor]:
     return {name: value for name in MAPS if (value := getattr(degraded, name)) is not None}
 
 
+def floating_leaves(params: Any) -> dict[str, Tensor]:
+    """Return copies of the floating fields of parameters, which require a gradient."""
+    fields = {name: value for name, value in params._asdict().items() if value is not None}
+    return {name: value.clone().requires_grad_() for name, value in fields.items() if value.is_floating_point()}
+
+
 def assert_equal_maps(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
     """Raise AssertionError unless all maps have equal bits."""
     assert actual.keys() == expected.keys()
@@ -103,6 +110,20 @@ def assert_close_images(actual: Tensor, expected: Tensor, *, shift_px: float = 0
     # Noise changes by at most its range from one pixel to the next, along each axis.
     tolerance = scale * (IMAGE + 2 * shift_px) + _ROUNDING.get(actual.dtype, 0.0)
     assert_close(actual.double(), expected.double(), rtol=1e-5, atol=tolerance)
+
+
+def seeded(function: Callable[..., Any], *inputs: Any) -> Any:
+    """Call a function from one global seed, so that an effect in it draws what it drew in the last such call."""
+    torch.manual_seed(3)
+    return function(*inputs)
+
+
+def assert_graph_agrees(effect: Callable[[Tensor], Tensor], image: Tensor, *, backend: str = "eager") -> None:
+    """Raise AssertionError unless a graph without a break draws and degrades twice as eager mode does."""
+    compiled = torch.compile(effect, fullgraph=True, backend=backend)
+    expected, actual = (seeded(lambda run: [run(image) for _ in range(2)], run) for run in (effect, compiled))
+    assert not torch.equal(*expected)
+    assert_close(actual, expected, rtol=0, atol=2e-4)
 
 
 def is_in_range(image: Tensor) -> bool:

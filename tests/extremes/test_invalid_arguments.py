@@ -7,15 +7,11 @@ from typing import Any
 
 import pytest
 import torch
+from domain import DOMAINS
 
 import torchrefract as tr
 
 GRAY = torch.full((1, 3, 8, 9), 0.5)
-EFFECTS = (
-    *(tr.LensDistortion, tr.Turbulence, tr.ThinPlateSpline, tr.DivergenceFree),
-    *(tr.PhysicalTurbulence, tr.RoadMirage),
-    *(tr.UniformFog, tr.HeterogeneousFog, tr.LensFlare, tr.SunGlare, tr.Exposure),
-)
 FOLDING: dict[str, Any] = {"k1_range": (-0.6, -0.6), "focal_range": (0.5, 0.5), "strict": True}
 
 
@@ -50,18 +46,7 @@ def noise(*scales: float, **options: Any) -> Any:
 
 # Calls; each name starts with the argument that the error names.
 CALLS: dict[str, Callable[[], Any]] = {
-    **{f"p of {kind.__name__}": lambda kind=kind: kind(p=1.5) for kind in EFFECTS},
-    # A strength below 0.
-    "amplitude_range of turbulence": lambda: tr.Turbulence(amplitude_range=(-1.0, 0.0)),
-    "amplitude_range of a thin-plate spline": lambda: tr.ThinPlateSpline(amplitude_range=(-1.0, 0.0)),
-    "amplitude_range of divergence-free warps": lambda: tr.DivergenceFree(amplitude_range=(-1.0, 0.0)),
-    "cn2_range of physical turbulence": lambda: tr.PhysicalTurbulence(cn2_range=(-1e-12, 0.0)),
-    "difference_range of a road mirage": lambda: tr.RoadMirage(difference_range=(-5.0, 5.0)),
-    "contrast_range of fog": lambda: tr.HeterogeneousFog(contrast_range=(-0.1, 0.1)),
-    "radius_range of flare": lambda: tr.LensFlare(radius_range=(-0.1, 0.2)),
-    "luminance_range of sun glare": lambda: tr.SunGlare(luminance_range=(-1.0, 2.0)),
-    "gamma_range of exposure": lambda: tr.Exposure(gamma_range=(-0.1, 0.2)),
-    "strength_range of flare": lambda: tr.LensFlare(strength_range=(-0.1, 0.2)),
+    **{f"p of {name}": lambda domain=domain: domain.kind(p=1.5) for name, domain in DOMAINS.items()},
     # A lens out of bounds, or one that folds.
     "k1_range = -1e3": lambda: tr.LensDistortion(k1_range=(-1e3, 0.0)),
     "k1_range = 1e30": lambda: tr.LensDistortion(k1_range=(0.0, 1e30)),
@@ -84,9 +69,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "points on a line": lambda: apply_spline((0.0, 0.0), (3.0, 1.0), (6.0, 2.0), (9.0, 3.0)),
     "points, two of them": lambda: apply_spline((0.0, 0.0), (9.0, 0.0)),
     "points at infinity": lambda: apply_spline((0.0, 0.0), (9.0, math.inf), (4.0, 4.0)),
-    # A visibility that is not positive, and an invalid depth.
-    "visibility_range = 0": lambda: tr.UniformFog(visibility_range=(0.0, 9.0)),
-    "visibility_range < 0": lambda: tr.HeterogeneousFog(visibility_range=(-1.0, 9.0)),
+    # An invalid depth.
     "depth < 0": lambda: fog(torch.full((1, 1, 8, 9), -1.0)),
     "depth NaN": lambda: fog(torch.full((1, 1, 8, 9), math.nan)),
     "depth of another shape": lambda: fog(torch.ones(1, 1, 9, 8)),

@@ -16,6 +16,7 @@ from helpers import (
     assert_close_images,
     assert_close_maps,
     combinations,
+    floating_leaves,
     is_in_range,
     maps_of,
     random_image,
@@ -143,11 +144,7 @@ def test_lens_gradients_are_finite_where_pixels_have_no_preimage(name, dtype, de
     for size in SIZES[1:]:
         image = random_image(2, 3, *size, dtype=dtype, device=device)
         params = effect.sample(image, seed=7)
-        leaves = {
-            key: v.clone().requires_grad_()
-            for key, v in params._asdict().items()
-            if v is not None and v.is_floating_point()
-        }
+        leaves = floating_leaves(params)
         degraded = effect.apply(image, params._replace(**leaves))
         for value in (degraded.image, degraded.flow, degraded.restore_flow):
             for gradient in torch.autograd.grad(value.double().sum(), list(leaves.values()), retain_graph=True):

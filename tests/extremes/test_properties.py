@@ -3,7 +3,7 @@
 import pytest
 import torch
 from domain import DOMAINS, IGNORE_STRENGTH, cases
-from helpers import assert_close_maps, is_in_range, maps_of, random_image
+from helpers import assert_close_maps, floating_leaves, is_in_range, maps_of, random_image
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -71,11 +71,7 @@ def test_results_are_finite_in_range_of_the_kind_of_the_image_and_independent_of
 def test_gradients_are_finite(name, data):
     effect, image = data.draw(cases(name, dtypes=FLOATS))
     params = effect.sample(image, seed=7)
-    leaves = {
-        key: v.clone().requires_grad_()
-        for key, v in params._asdict().items()
-        if v is not None and v.is_floating_point()
-    }
+    leaves = floating_leaves(params)
     image = image.clone().requires_grad_()
     result = effect.apply(image, params._replace(**leaves)).image
     weights = random_image(*result.shape, dtype=result.dtype, seed=1)

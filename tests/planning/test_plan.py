@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import tolerance
 import torch
+from helpers import floating_leaves
 from torch.testing import assert_close
 
 from torchrefract import (
@@ -93,12 +94,7 @@ def test_parameters_outside_the_ranges_are_computed_exactly(name):
 def test_gradients_agree_with_those_of_the_exact_flow_within_the_tolerance(name):
     image = picture().double()
     params = effect_with(name, 0.1).sample(image, seed=2)
-    names = [
-        field
-        for field, value in params._asdict().items()
-        if value is not None and value.is_floating_point() and field != "frame"
-    ]
-    leaves = {field: getattr(params, field).clone().requires_grad_() for field in names}
+    leaves = {field: value for field, value in floating_leaves(params).items() if field != "frame"}
     weight = torch.rand(2, 2, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     gradients = []
     for effect in (effect_with(name, 0.1), effect_with(name, None)):

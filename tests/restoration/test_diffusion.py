@@ -13,14 +13,7 @@ from torch.testing import assert_close
 from torchrefract import LensDistortion, Pair, UniformFog
 from torchrefract.random import stream
 from torchrefract.restoration.checkpoints import CheckpointError, check_fits, read_checkpoint
-from torchrefract.restoration.diffusion import (
-    Diffusion,
-    FlowTarget,
-    ImageTarget,
-    normal,
-    sample,
-    target_of,
-)
+from torchrefract.restoration.diffusion import Diffusion, FlowTarget, ImageTarget, normal, sample, target_of
 from torchrefract.restoration.models.denoiser import Denoiser
 from torchrefract.restoration.tasks import Deweather, Undistort
 

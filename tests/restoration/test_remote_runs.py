@@ -2,12 +2,11 @@
 
 import os
 import signal
-from typing import Any
 
 import numpy as np
 import pytest
-from fsspec.implementations.memory import MemoryFileSystem
 from PIL import Image
+from stores import failing_writes
 
 from torchrefract._io import as_path
 from torchrefract.restoration.checkpoints import read_checkpoint
@@ -60,11 +59,8 @@ def test_a_checkpoint_that_is_missing_in_a_store_is_one_line_of_error(call, smal
     assert message == f"{expected}{store}/none.ckpt"
 
 
-def test_a_run_folder_in_a_store_that_denies_writing_is_one_line_of_error(call, small, monkeypatch):
-    def deny(*_: Any, **__: Any) -> None:
-        raise PermissionError("Access Denied")
-
-    monkeypatch.setattr(MemoryFileSystem, "put_file", deny)
-    message = call("train", "+task=undistort", *small, "run_dir=memory://denied").message
+def test_a_run_folder_in_a_store_that_denies_writing_is_one_line_of_error(call, small):
+    with failing_writes(PermissionError("Access Denied")):
+        message = call("train", "+task=undistort", *small, "run_dir=memory://denied").message
     condition = "run_dir must name what can be read or written"
     assert message == f"{condition}, got memory://denied/config.yaml: Permission denied"

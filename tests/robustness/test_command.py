@@ -5,10 +5,10 @@ import json
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import files_in, save_picture
 from PIL import Image
 from torchvision import models
 
@@ -17,7 +17,8 @@ from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.robustness.predictors import load_predictor
 from torchrefract.robustness.quantities import QUANTITIES
 
-COMMAND = ("robustness.__main__", "model=bright:detect", "data=frames", "out=out")
+DETECT = "model=bright:detect"
+DASHCAM = ("scene=cheap_dashcam", "severity=1")
 MODEL = """
 import torch
 
@@ -46,6 +47,9 @@ def nobody(prediction, target):
 def one(images):
     return detect(images)[0]
 
+def segment(images):
+    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)
+
 def none(images):
     return None
 
@@ -54,30 +58,36 @@ network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(),
 
 
 @pytest.fixture
-def frames(tmp_path, monkeypatch) -> Path:
+def frames(tmp_path, write_module) -> Path:
     """Write four pictures with a bright square, their labels, and a model."""
     folder = tmp_path / "frames"
-    folder.mkdir()
     images, rows = [], []
     for i in range(4):
         picture = np.full((72, 128, 3), 90, np.uint8)
         picture[30:50, 40 + 10 * i : 60 + 10 * i] = 255
-        cv2.imwrite(str(folder / f"{i} a=b.png"), picture)
+        save_picture(folder / f"{i} a=b.png", picture)
         images.append({"id": i, "file_name": f"{i} a=b.png", "height": 72, "width": 128})
         rows.append({"id": i, "image_id": i, "bbox": [40 + 10 * i, 30, 20, 20], "category_id": 1})
     (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": rows}))
-    (tmp_path / "bright.py").write_text(MODEL)
-    monkeypatch.syspath_prepend(tmp_path)
+    write_module("bright", MODEL)
     return folder
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")}
+    return {name: (folder / name).read_bytes() for name in files_in(folder)}
 
 
-def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, tmp_path, frames):
-    words = (*COMMAND, "labels=coco.json", "scene=[cape_town_fog,cheap_dashcam]", "severity=[1,5]")
-    outcome = call(*words)
+def kill(out: Path) -> None:
+    """Leave the files of a run that is killed while it writes its third score."""
+    lines = (out / "scores.jsonl").read_bytes().splitlines(keepends=True)
+    for path in out.iterdir():
+        path.unlink()
+    (out / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
+
+
+def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(score, tmp_path, frames):
+    words = (DETECT, "labels=coco.json", "scene=[cape_town_fog,cheap_dashcam]", "severity=[1,5]")
+    outcome = score(*words)
     assert outcome.code == 0
     assert "out/report.html: 4 pictures, clean score 1.000" in outcome.out
     complete = contents(tmp_path / "out")
@@ -91,20 +101,16 @@ def test_a_run_writes_tables_and_a_report_and_continues_with_equal_bytes(call, t
     # A lens keeps the square in one piece, and its label moves with it.
     assert [row["score"] for row in results["levels"][2:]] == [1, 1]
     assert complete["report.html"].count(b"data:image/jpeg;base64,") == 2  # of the fog; the lens takes nothing
-    # A run that was killed in the middle of a line continues.
-    lines = complete["scores.jsonl"].splitlines(keepends=True)
-    for path in (tmp_path / "out").iterdir():
-        path.unlink()
-    (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
-    assert call(*words).code == 0
+    kill(tmp_path / "out")
+    assert score(*words).code == 0
     assert contents(tmp_path / "out") == complete
 
 
-def test_worst_cases_stand_in_the_tables_and_the_report_and_continue_with_equal_bytes(call, tmp_path, frames):
-    words = (COMMAND[0], "model=bright:brightness", *COMMAND[2:], "labels=coco.json", "score=bright:darkness")
+def test_worst_cases_stand_in_the_tables_and_the_report_and_continue_with_equal_bytes(score, tmp_path, frames):
+    words = ("model=bright:brightness", "labels=coco.json", "score=bright:darkness")
     words += ("scene=[cape_town_fog,cheap_dashcam]", "severity=[1,3]")
     search = ("worst_case=true", "worst_case_draws=3")
-    outcome = call(*words, *search)
+    outcome = score(*words, *search)
     assert outcome.code == 0, outcome.err
     complete = contents(tmp_path / "out")
     results = json.loads(complete["results.json"])
@@ -143,21 +149,16 @@ def test_worst_cases_stand_in_the_tables_and_the_report_and_continue_with_equal_
         mean = np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))).mean() / 255
         assert abs(1 - mean - lowest) < 0.002
     assert pictures
-    # A run that was killed continues, with the same search alone.
-    lines = complete["scores.jsonl"].splitlines(keepends=True)
-    for path in (tmp_path / "out").iterdir():
-        path.unlink()
-    (tmp_path / "out" / "scores.jsonl").write_bytes(b"".join(lines[:3]) + lines[3][:20])
+    kill(tmp_path / "out")
     for other in ((), ("worst_case=true",)):
-        message = call(*words, *other).err.splitlines()[-1]
+        message = score(*words, *other).err.splitlines()[-1]
         assert message.endswith("of the same settings, got one with worst_case_draws=3; choose another")
-    assert call(*words, *search).code == 0
+    assert score(*words, *search).code == 0
     assert contents(tmp_path / "out") == complete
 
 
-def test_a_run_without_worst_cases_has_none_and_continues_one_of_an_earlier_version(call, tmp_path, frames):
-    words = (*COMMAND, "scene=cheap_dashcam", "severity=1")
-    assert call(*words).code == 0
+def test_a_run_without_worst_cases_has_none_and_continues_one_of_an_earlier_version(score, tmp_path, frames):
+    assert score(DETECT, *DASHCAM).code == 0
     complete = contents(tmp_path / "out")
     assert all(b"worst_case_low" not in complete[name] for name in ("results.csv", "results.json"))
     assert b"worst case" not in complete["report.html"]
@@ -165,16 +166,14 @@ def test_a_run_without_worst_cases_has_none_and_continues_one_of_an_earlier_vers
     settings, *lines = [json.loads(line) for line in path.read_text().splitlines()]
     for name in ("worst_case_draws", "camera", "horizon"):  # 0.2.0 had none, and three numbers for each score
         del settings[name]
-    rows = [
-        of | {"clean": of["clean"][:3], "levels": [[*level, score[:3]] for *level, score in of["levels"]]}
-        for of in lines
-    ]
-    path.write_text("".join(json.dumps(row) + "\n" for row in [settings, *rows]))
-    assert call(*words).code == 0
+    for of in lines:
+        of |= {"clean": of["clean"][:3], "levels": [[*level, numbers[:3]] for *level, numbers in of["levels"]]}
+    path.write_text("".join(json.dumps(row) + "\n" for row in [settings, *lines]))
+    assert score(DETECT, *DASHCAM).code == 0
     assert (tmp_path / "out" / "results.csv").read_bytes() == complete["results.csv"]
 
 
-def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_files_are_read(call, tmp_path, frames):
+def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_files_are_read(score, tmp_path, frames):
     labels = tmp_path / "labels"
     for folder, i in (("left", 0), ("right", 3)):
         (frames / folder).mkdir()
@@ -184,98 +183,76 @@ def test_pictures_of_one_name_in_two_folders_have_labels_of_their_own_and_yolo_f
         (labels / folder / "same.txt").write_text(f"1 {x} {y} {20 / 128} {20 / 72}\n")
     for path in frames.glob("*.png"):
         path.unlink()
-    outcome = call(*COMMAND, "labels=labels", "scene=cheap_dashcam", "severity=1")
-    assert "2 pictures, clean score 1.000" in outcome.out
+    words = (DETECT, "labels=labels", *DASHCAM)
+    assert "2 pictures, clean score 1.000" in score(*words).out
     (labels / "left" / "same.txt").write_text("1 0.1 0.1 0.1 0.1\n")
-    assert call(*COMMAND, "labels=labels", "scene=cheap_dashcam", "severity=1").message.startswith(
-        "out must be a folder of the same settings, got one with labels="
-    )
-    outcome = call(*COMMAND[:-1], "out=o2", "labels=labels", "scene=cheap_dashcam", "severity=1")
-    assert "clean score 0.500" in outcome.out
+    assert score(*words).message.startswith("out must be a folder of the same settings, got one with labels=")
+    assert "clean score 0.500" in score(*words, out="o2").out
     (labels / "right" / "same.txt").unlink()  # an empty road, on which the model sees something
-    message = call(*COMMAND[:-1], "out=o3", "labels=labels", "scene=cheap_dashcam", "severity=1").message
+    message = score(*words, out="o3").message
     assert message == "model must score above 0 on a clean picture, got 0 on all: check labels and classes"
 
 
-def test_a_depth_that_is_assumed_is_said(call, frames):
-    assert "assumes the depth of a road between walls" in call(*COMMAND, "scene=cape_town_fog", "severity=1").err
-    assert call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam", "severity=1").err == ""
+def test_a_depth_that_is_assumed_is_said(score, frames):
+    assert "assumes the depth of a road between walls" in score(DETECT, "scene=cape_town_fog", "severity=1").err
+    assert score(DETECT, *DASHCAM, out="o2").err == ""
 
 
-def test_depth_maps_of_the_pictures_are_taken(call, tmp_path, frames):
+def test_depth_maps_of_the_pictures_are_taken(score, results, tmp_path, frames):
     for folder, meters in (("near", 1), ("far", 40)):
         for path in frames.iterdir():
             target = DepthFolder(tmp_path / folder).path(path.name)
             target.parent.mkdir(exist_ok=True)
             write_depth(target, torch.full((72, 128), float(meters)))
-    words = ("scene=cape_town_fog", "severity=4", "labels=coco.json")
-    near = call(*COMMAND[:-1], "out=o1", "depth=near", *words)
-    assert near.err == ""
-    assert call(*COMMAND[:-1], "out=o2", "depth=far", *words).code == 0
-    near, far = (
-        json.loads((tmp_path / out / "results.json").read_text())["levels"][0]["score"] for out in ("o1", "o2")
-    )
-    assert near == 1  # the square is seen through 1 m of fog, and not through 40 m
-    assert far == 0
+    words = (DETECT, "scene=cape_town_fog", "severity=4", "labels=coco.json")
+    for depth, expected in (("near", 1), ("far", 0)):  # the square is seen through 1 m of fog, and not through 40 m
+        assert score(*words, f"depth={depth}", out=f"of_{depth}").err == ""
+        assert results(f"of_{depth}")["levels"][0]["score"] == expected
     (tmp_path / "far" / "0 a=b.png").unlink()
-    assert "depth must" in call(*COMMAND[:-1], "out=o3", "depth=far", *words).message
+    assert "depth must" in score(*words, "depth=far", out="o3").message
 
 
-def test_other_settings_in_the_same_folder_are_refused(call, frames):
-    assert call(*COMMAND, "scene=[cheap_dashcam]", "severity=[1]").code == 0
-    message = call(*COMMAND, "scene=[cheap_dashcam]", "severity=[2]").message
+def test_other_settings_in_the_same_folder_are_refused(score, frames):
+    assert score(DETECT, "scene=[cheap_dashcam]", "severity=[1]").code == 0
+    message = score(DETECT, "scene=[cheap_dashcam]", "severity=[2]").message
     assert message == "out must be a folder of the same settings, got one with severity=[1]; choose another"
 
 
-def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_score(call, tmp_path, frames):
-    outcome = call(*COMMAND, "score=bright:count", "scene=cheap_dashcam", "severity=5", "limit=2")
+def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_score(score, frames):
+    outcome = score(DETECT, "score=bright:count", "scene=cheap_dashcam", "severity=5", "limit=2")
     assert "2 pictures, clean score 1.000" in outcome.out
     assert "cheap_dashcam: k1 all tested, the strongest -0." in outcome.out
 
 
-def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(call, tmp_path, frames):
+def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(score, tmp_path, frames):
     for path in frames.iterdir():
-        cv2.imwrite(str(path), np.full((72, 128, 3), 90, np.uint8))
-    message = call(*COMMAND, "scene=cheap_dashcam", "severity=5").message
+        save_picture(path, np.full((72, 128, 3), 90, np.uint8))
+    message = score(DETECT, "scene=cheap_dashcam", "severity=5").message
     assert message.startswith(
         "model must detect something with a score of at least 0.5 in a clean picture, got nothing"
     )
     assert not list(tmp_path.glob("out/results*"))
 
 
-def test_masks_of_0_and_255_whose_255_is_not_scored_are_warned_of(call, tmp_path, frames):
-    (tmp_path / "masks").mkdir()
+def test_masks_of_0_and_255_whose_255_is_not_scored_are_warned_of(score, tmp_path, frames):
     mask = np.zeros((72, 128), np.uint8)
-    (tmp_path / "classes.py").write_text(
-        "import torch\n\ndef segment(images):\n    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)\n"
-    )
-    words = ("robustness.__main__", "model=classes:segment", "data=frames", "scene=cheap_dashcam", "severity=1")
     for value, is_warned in ((255, True), (1, False)):
         mask[:, 64:] = value
         for path in frames.iterdir():
-            cv2.imwrite(str(tmp_path / "masks" / path.name), mask)
-        outcome = call(*words, "labels=masks", f"out=out{value}")
+            save_picture(tmp_path / "masks" / path.name, mask)
+        outcome = score("model=bright:segment", *DASHCAM, "labels=masks", out=f"out{value}")
         assert outcome.code == 0, outcome.err
         assert ("at most one class beside 255, which is not scored, so that the scores say" in outcome.err) == is_warned
 
 
-def test_masks_and_modules_are_taken(call, tmp_path, frames):
-    masks = tmp_path / "masks"
-    masks.mkdir()
+def test_masks_and_modules_are_taken(score, tmp_path, frames):
     for path in frames.iterdir():
-        cv2.imwrite(str(masks / path.name), np.zeros((72, 128), np.uint8))
-    (tmp_path / "classes.py").write_text(
-        "import torch\n\ndef segment(images):\n    return torch.stack([1 - images[:, 0], images[:, 0] - 0.9], dim=1)\n"
-    )
-    words = ("robustness.__main__", "model=classes:segment", "data=frames", "scene=cheap_dashcam", "severity=1")
-    first = call(*words, "labels=masks", "out=out").out
+        save_picture(tmp_path / "masks" / path.name, np.zeros((72, 128), np.uint8))
+        save_picture(tmp_path / "deep" / path.name, np.zeros((72, 128), np.uint16))
+    first = score("model=bright:segment", *DASHCAM, "labels=masks").out
     assert re.search(r"4 pictures, clean score (0\.\d+), mIoU \1", first)  # all pictures have the same pixels
-    (tmp_path / "deep").mkdir()
-    for path in frames.iterdir():
-        cv2.imwrite(str(tmp_path / "deep" / path.name), np.zeros((72, 128), np.uint16))
-    assert call(*words, "labels=deep", "out=o3").out == first.replace("out/", "o3/")
-    outcome = call("robustness.__main__", "model=bright:network", "data=frames", "out=o2", "scene=cheap_dashcam")
-    assert "clean score 1.000" in outcome.out
+    assert score("model=bright:segment", *DASHCAM, "labels=deep", out="o3").out == first.replace("out/", "o3/")
+    assert "clean score 1.000" in score("model=bright:network", "scene=cheap_dashcam", out="o2").out
 
 
 @pytest.mark.parametrize(
@@ -307,15 +284,13 @@ def test_masks_and_modules_are_taken(call, tmp_path, frames):
         ("worst_case=7", "worst_case must be True or False, got 7"),
         ("worst_case_draws=1", "worst_case_draws must be at least 2, got 1"),
         ("weights=damaged.pt", "model: weights must be a state_dict of resnet18, got damaged.pt ("),
-        (
-            "model=bright:one weights=other.pt",
-            "model: weights must be null unless the model is torchvision:name, got o",
-        ),
+        ("model=bright:one weights=other.pt", "model: weights must be null unless the model is torchvision:name"),
         ("weights=other.pt", "model: weights must be a state_dict of resnet18, got other.pt (Error(s) in loading"),
         ("score=bright:nothing", "score: a function must be package.module:name"),
     ],
 )
 def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, message):
+    command = {"model": "bright:detect", "data": "frames", "out": "out", "scene": "cheap_dashcam"}
     (tmp_path / "few.json").write_text('{"images": [], "annotations": []}')
     document = json.loads((tmp_path / "coco.json").read_text())
     for name, change in (("outline", {"bbox": []}), ("names", {"category_id": "car"})):
@@ -324,61 +299,59 @@ def test_an_invalid_option_is_one_line_of_error(call, tmp_path, frames, word, me
     torch.save({}, tmp_path / "other.pt")
     for suffix in (".pt", ".pt2", ".onnx"):
         (tmp_path / f"damaged{suffix}").write_text("nothing")
-    words = (word,) if word.startswith("scene") else (*word.split(), "scene=cheap_dashcam")
-    words += ("model=torchvision:resnet18",) if word.startswith("weights") else ()
-    assert call(*COMMAND, *words).message.startswith(message)
+    command |= {"model": "torchvision:resnet18"} if word.startswith("weights") else {}
+    command |= dict(option.split("=") for option in word.split())
+    words = (f"{name}={value}" for name, value in command.items())
+    assert call("robustness.__main__", *words).message.startswith(message)
     assert not list(tmp_path.glob("out/results*"))
 
 
-def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(call, tmp_path, frames):
-    cv2.imwrite(str(frames / "white.png"), np.full((72, 128, 3), 255, np.uint8))
-    outcome = call(*COMMAND, "scene=cheap_dashcam", "severity=1")
+def test_a_model_that_fails_for_one_picture_is_said_and_for_all_stops(score, tmp_path, frames):
+    save_picture(frames / "white.png", np.full((72, 128, 3), 255, np.uint8))
+    outcome = score(DETECT, *DASHCAM)
     assert "warning: the model failed for white.png, which are left out" in outcome.err
     assert "4 pictures" in outcome.out
     assert b"a white picture" in (tmp_path / "out" / "report.html").read_bytes()
     for path in frames.glob("* a=b.png"):
         path.unlink()
-    message = call(*COMMAND[:-1], "out=o2", "scene=cheap_dashcam").message
+    message = score(DETECT, "scene=cheap_dashcam", out="o2").message
     assert message.endswith("the last was white.png: RuntimeError: a white picture")
 
 
 @pytest.mark.filterwarnings("ignore:.*deprecated:FutureWarning")  # of TorchScript, which people still have
-def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(call, tmp_path, frames):
-    words = ("robustness.__main__", "model=net.pt", "data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
+def test_another_model_under_the_name_of_the_first_is_not_mixed_with_its_scores(score, tmp_path, frames):
     for shift, code in ((0.0, 0), (0.0, 0), (1.0, 1)):
         network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool2d(1), torch.nn.Flatten(), torch.nn.Linear(3, 2))
         for parameter in network.parameters():
             torch.nn.init.constant_(parameter, shift)
         torch.jit.save(torch.jit.script(network), tmp_path / "net.pt")
-        outcome = call(*words)
+        outcome = score("model=net.pt", *DASHCAM)
         assert outcome.code == code, outcome.err
     assert "error: out must be a folder of the same settings, got one with files={'net.pt': " in outcome.err
 
 
 @pytest.mark.parametrize("changed", ["model", "score"])
-def test_a_run_is_not_continued_after_a_change_of_the_module_of_its_model_or_score(call, tmp_path, frames, changed):
+def test_a_run_is_not_continued_after_a_change_of_the_module_of_its_model_or_score(score, tmp_path, frames, changed):
     names = {"model": f"model_of_{changed}", "score": f"score_of_{changed}"}  # this process has imported the others
     for name in names.values():
         (tmp_path / f"{name}.py").write_text(MODEL)
-    words = ("robustness.__main__", f"model={names['model']}:detect", f"score={names['score']}:count", *COMMAND[2:])
-    words += ("scene=cheap_dashcam", "severity=1")
+    words = (f"model={names['model']}:detect", f"score={names['score']}:count", *DASHCAM)
     for text, code in ((MODEL, 0), (MODEL, 0), (MODEL + "# other weights", 1)):
         (tmp_path / f"{names[changed]}.py").write_text(text)
-        outcome = call(*words)
+        outcome = score(*words)
         assert outcome.code == code, outcome.err
     assert "out must be a folder of the same settings, got one with files={" in outcome.err
 
 
-def test_a_file_that_is_no_picture_is_named_and_skipped(call, tmp_path, frames):
-    words = ("scene=cheap_dashcam", "severity=1")
-    expected = call(*COMMAND, *words).out
+def test_a_file_that_is_no_picture_is_named_and_skipped(score, frames):
+    expected = score(DETECT, *DASHCAM).out
     (frames / "empty.png").touch()
-    outcome = call(*COMMAND[:-1], "out=o2", *words)
+    outcome = score(DETECT, *DASHCAM, out="o2")
     assert outcome.out == expected.replace("out/", "o2/")
     assert outcome.err.count("skipped: frames/empty.png is empty (0 bytes)\n") == 1
     for path in frames.glob("* a=b.png"):
         path.unlink()
-    *_, message = call(*COMMAND[:-1], "out=o3", *words).err.splitlines()
+    *_, message = score(DETECT, *DASHCAM, out="o3").err.splitlines()
     assert message == "error: data must hold a picture that can be read, got frames/empty.png is empty (0 bytes)"
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from targets import boxes_of
 from torch import Tensor, nn
 from torchvision import tv_tensors
 
@@ -171,10 +172,7 @@ def test_labels_and_clean_predictions_move_along_the_flow():
         return [{"boxes": box[None], "labels": torch.tensor([1]), "scores": torch.tensor([0.9])}]
 
     lens = LensDistortion(k1_range=(-0.5, -0.4), k2_range=(0.15, 0.2), focal_range=(0.7, 0.8))
-    boxes = tv_tensors.BoundingBoxes(  # pyright: ignore[reportCallIssue]  # torchvision's overloads
-        torch.tensor([[60.0, 20, 80, 32]]), format="XYXY", canvas_size=(60, 90)
-    )
-    target = {"boxes": boxes, "labels": torch.tensor([1])}
+    target = {"boxes": boxes_of([[60.0, 20, 80, 32]], (60, 90)), "labels": torch.tensor([1])}
     still = detection_score(predict(lens.degrade(image, seed=0).image[None])[0], target)
     assert still == 0  # the lens moves the box by more than half of its size
     for given in (target, None):

@@ -1,9 +1,8 @@
-import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from pictures import save_picture
 
 from torchrefract import Compose, LensDistortion, OneOf, UniformFog, Vignetting, key_of, presets
 from torchrefract.data.images import read_image
@@ -41,33 +40,21 @@ BY_SEVERITY = """
 
 
 @pytest.fixture
-def frames(tmp_path, monkeypatch) -> Path:
-    folder = tmp_path / "frames"
-    folder.mkdir()
+def frames(tmp_path, write_module) -> Path:
     picture = np.random.default_rng(0).integers(0, 90, (36, 64, 3), np.uint8)
     for i in range(2):
-        cv2.imwrite(str(folder / f"{i}.png"), picture + 40 * i)
-    (tmp_path / "mine.py").write_text(MODULE)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(__import__("sys").modules, "mine", raising=False)
-    return folder
-
-
-def levels(tmp_path: Path) -> dict[tuple[str, int], dict]:
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())["levels"]
-    return {(row["scene"], row["severity"]): row for row in rows}
+        save_picture(tmp_path / "frames" / f"{i}.png", picture + 40 * i)
+    write_module("mine", MODULE)
+    return tmp_path / "frames"
 
 
 def expected(frames: Path, effect) -> float:
     images = {path.name: read_image(path) for path in sorted(frames.iterdir())}
-    return float(
-        np.mean(
-            [1 - effect.degrade(image, seed=0, keys=[key_of(n)]).image.mean().item() for n, image in images.items()]
-        )
-    )
+    degraded = [effect.degrade(image, seed=0, keys=[key_of(name)]).image for name, image in images.items()]
+    return 1 - float(np.mean([image.mean().item() for image in degraded]))
 
 
-def test_scenes_of_a_folder_a_file_and_a_function_are_scored_with_their_quantities(call, tmp_path, frames):
+def test_scenes_of_a_folder_a_file_and_a_function_are_scored_with_their_quantities(call, results, tmp_path, frames):
     (tmp_path / "conf" / "scene").mkdir(parents=True)
     (tmp_path / "conf" / "scene" / "thick.yaml").write_text(
         "_target_: torchrefract.presets.cape_town_fog\nseverity: 1\ncontrast_range: [0.9, 0.9]\n"
@@ -76,7 +63,7 @@ def test_scenes_of_a_folder_a_file_and_a_function_are_scored_with_their_quantiti
     scenes = "scene=[conf/scene/thick.yaml,my fog.yaml,mine:fog,mine:corners,paper_weather]"
     outcome = call(*RUN, scenes, "severity=[2,4]")
     assert outcome.code == 0, outcome.err
-    rows = levels(tmp_path)
+    rows = {(row["scene"], row["severity"]): row for row in results()["levels"]}
     fogs = {2: UniformFog(visibility_range=(200, 400)), 4: UniformFog(visibility_range=(40, 80))}
     for severity, fog in fogs.items():
         effects = {
@@ -122,10 +109,7 @@ def test_a_run_is_not_continued_with_other_parameters_of_a_scene(call, tmp_path,
         ("scene=few.yaml", "scene: few.yaml must hold the _target_ of an effect, or one for severity 1, got neither"),
         ("scene=list.yaml", "scene must be a mapping with the _target_ of an effect, got list in list.yaml"),
         ("scene=one.yaml", "scene must have a severity if several are scored, got one.yaml without one; write an eff"),
-        (
-            "scene=mine --config-dir conf",
-            "scene must be given as a file, as in scene=[DIR/scene/mine.yaml], got --conf",
-        ),
+        ("scene=mine --config-dir conf", "scene must be given as a file, as in scene=[DIR/scene/mine.yaml], got -"),
         ("scene=wrong.yaml", "scene: visibility_range must "),
     ],
 )

@@ -146,12 +146,14 @@ def test_transformers_models_of_other_tasks_and_lost_ones_are_refused(write, tmp
             load_predictor(f"transformers:{name}")
 
 
-def test_another_transformers_model_in_the_same_folder_is_not_mixed_with_the_scores_of_the_first(call, write, tmp_path):
+def test_another_transformers_model_in_the_same_folder_is_not_mixed_with_the_scores_of_the_first(
+    score, write, tmp_path
+):
     (tmp_path / "frames").mkdir()
     picture(72, 128).save(tmp_path / "frames" / "0.png")
-    words = ("robustness.__main__", "data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
     for seed, code in ((0, 0), (0, 0), (1, 1)):
-        outcome = call(*words, f"model=transformers:{write('segmenter', seed=seed).name}")
+        model = f"model=transformers:{write('segmenter', seed=seed).name}"
+        outcome = score(model, "scene=cheap_dashcam", "severity=1")
         assert outcome.code == code, outcome.err
     assert "out must be a folder of the same settings, got one with files={'segmenter/config.json': " in outcome.err
 
@@ -174,13 +176,13 @@ def test_files_of_a_model_are_those_that_it_is_loaded_from(tmp_path, monkeypatch
     ("library", "remedy"), [("transformers", 'pip install "torchrefract[depth]"'), ("ultralytics", "pip install ultra")]
 )
 def test_a_missing_library_is_one_line_of_error_with_the_command_that_installs_it(
-    call, tmp_path, monkeypatch, library, remedy
+    score, tmp_path, monkeypatch, library, remedy
 ):
     (tmp_path / "frames").mkdir()
     picture(8, 8).save(tmp_path / "frames" / "0.png")
     monkeypatch.setitem(sys.modules, library, None)
-    outcome = call("robustness.__main__", f"model={library}:best.pt", "data=frames", "out=out")
-    assert outcome.message.startswith(f"model: {library}:best.pt needs {library}: {remedy}")
+    message = score(f"model={library}:best.pt").message
+    assert message.startswith(f"model: {library}:best.pt needs {library}: {remedy}")
 
 
 @pytest.fixture

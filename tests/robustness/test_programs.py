@@ -4,12 +4,14 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import save_picture
 from torch import Tensor, nn
 from torch.testing import assert_close
+from torchvision.models.detection.anchor_utils import DefaultBoxGenerator
+from torchvision.models.detection.ssd import SSD
 
 from torchrefract.robustness.predictors import load_predictor
 
@@ -25,16 +27,12 @@ NAMES = ["boxes", "scores", "labels"]  # the order of SSD
 @pytest.fixture(scope="module")
 def detector() -> nn.Module:
     """Return a detector of torchvision with a tiny backbone and random weights."""
-    detection = pytest.importorskip("torchvision.models.detection.ssd", reason="torchvision is in the extra train")
-    anchors = pytest.importorskip(
-        "torchvision.models.detection.anchor_utils", reason="torchvision is in the extra train"
-    )
     torch.manual_seed(0)
     layers = [nn.Conv2d(3, 8, 3, 2, 1), nn.ReLU(), nn.Conv2d(8, 8, 3, 2, 1), nn.ReLU(), nn.Conv2d(8, 8, 3, 2, 1)]
     backbone = nn.Sequential(*layers)
     backbone.out_channels = [8]  # pyright: ignore[reportArgumentType]  # torchvision reads it
-    boxes = anchors.DefaultBoxGenerator([[2]], scales=[0.2, 0.5])
-    return detection.SSD(backbone, boxes, (64, 96), 3, head=None).eval()
+    boxes = DefaultBoxGenerator([[2]], scales=[0.2, 0.5])
+    return SSD(backbone, boxes, (64, 96), 3, head=None).eval()
 
 
 @pytest.fixture
@@ -87,21 +85,18 @@ def test_outputs_with_a_dimension_of_the_batch_are_taken(tmp_path, image):
         assert prediction["scores"].tolist() == [0.5, 0]
 
 
-def test_outputs_that_are_no_prediction_are_named_with_the_remedy(call, tmp_path, write):
+def test_outputs_that_are_no_prediction_are_named_with_the_remedy(score, tmp_path, write):
     write(".onnx")
-    (tmp_path / "frames").mkdir()
-    cv2.imwrite(str(tmp_path / "frames" / "0.png"), np.full((*SIZE, 3), 90, np.uint8))
-    torch.export.save(
-        torch.export.export(nn.Sequential(nn.Flatten(1), nn.Unflatten(1, (6, -1))), (torch.rand(1, 3, *SIZE),)),
-        tmp_path / "yolo.pt2",
-    )
-    words = ("data=frames", "out=out", "scene=cheap_dashcam", "severity=1")
-    message = call("robustness.__main__", "model=detector.onnx", *words).message
+    save_picture(tmp_path / "frames" / "0.png", np.full((*SIZE, 3), 90, np.uint8))
+    yolo = nn.Sequential(nn.Flatten(1), nn.Unflatten(1, (6, -1)))
+    torch.export.save(torch.export.export(yolo, (torch.rand(1, 3, *SIZE),)), tmp_path / "yolo.pt2")
+    words = ("scene=cheap_dashcam", "severity=1")
+    message = score("model=detector.onnx", *words).message
     assert "model must have the outputs boxes, labels and scores, or a first one (1, K), (1, K, 72, 128)" in message
     assert message.endswith("; export it with these names, or pass a function: model=package.module:callable")
     assert message.count("(n, 4)") == 0
     assert ", 4)" in message
-    message = call("robustness.__main__", "model=yolo.pt2", *words).message
+    message = score("model=yolo.pt2", *words).message
     assert f"got outputs 0 (1, 6, {3 * 72 * 128 // 6})" in message
 
 

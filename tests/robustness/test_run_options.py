@@ -7,11 +7,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from matplotlib import colormaps
+from pictures import save_picture, save_turned
 from PIL import Image
 
 import torchrefract
@@ -58,19 +58,12 @@ CAMERA = Camera(width=64, height=36, fx=80.0, fy=80.0, cx=31.5, cy=17.5, coeffic
 
 
 @pytest.fixture
-def frames(tmp_path, monkeypatch) -> Path:
+def frames(tmp_path, write_module) -> Path:
     """Write four gray pictures and a white one, and models; the error of `brightness` is the mean of its picture."""
-    folder = tmp_path / "frames"
-    folder.mkdir()
     for i, level in enumerate((0, 40, 80, 120, 255)):
-        cv2.imwrite(str(folder / f"{i}.png"), np.full((36, 64, 3), level, np.uint8))
-    (tmp_path / "gray.py").write_text(MODEL)
-    monkeypatch.syspath_prepend(tmp_path)
-    return folder
-
-
-def results(out: Path) -> dict:
-    return json.loads((out / "results.json").read_text())
+        save_picture(tmp_path / "frames" / f"{i}.png", np.full((36, 64, 3), level, np.uint8))
+    write_module("gray", MODEL)
+    return tmp_path / "frames"
 
 
 def scores(out: Path) -> dict[str, list]:
@@ -82,7 +75,7 @@ def test_a_picture_that_changed_after_it_was_scored_is_scored_again(call, tmp_pa
     run = (*RUN, "scene=[cheap_dashcam]", "model=gray:brightness", "out=out")
     assert call(*run).code == 0
     before = scores(tmp_path / "out")
-    cv2.imwrite(str(frames / "1.png"), np.full((36, 64, 3), 100, np.uint8))
+    save_picture(frames / "1.png", np.full((36, 64, 3), 100, np.uint8))
     assert call(*run).code == 0
     after = scores(tmp_path / "out")
     assert [name for name in after if after[name] != before[name]] == ["1.png"]
@@ -92,7 +85,7 @@ def test_a_picture_that_changed_after_it_was_scored_is_scored_again(call, tmp_pa
 # --- beside a base run
 
 
-def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_out(call, tmp_path, frames):
+def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_out(call, results, tmp_path, frames):
     assert call(*RUN, FOG, "model=gray:shaken", "out=base").code == 0
     (frames / "0.png").unlink()
     outcome = call(*RUN, FOG, "model=gray:brightness", "out=out", "base=base")
@@ -104,18 +97,15 @@ def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_
         for out in ("out", "base")
         for scene in ("cape_town_fog", "cheap_dashcam")
     }
-    expected = {
-        scene: errors["out", scene] / errors["base", scene] for scene in dict.fromkeys(scene for _, scene in errors)
-    }
-    of_both = results(tmp_path / "out")["corruption_error"]
+    expected = {name: errors["out", name] / errors["base", name] for name in ("cape_town_fog", "cheap_dashcam")}
+    of_both = results()["corruption_error"]
     assert of_both["scenes"] == pytest.approx(expected, rel=1e-6)
     assert of_both["scenes"] == pytest.approx({scene: 2.0 for scene in expected}, rel=1e-4)  # half of the error
     assert of_both["mean"] == pytest.approx(np.mean(list(expected.values())))
     assert (of_both["num_images"], of_both["left_out"], of_both["left_out_of_base"]) == (3, 1, 1)
     assert (of_both["base"], of_both["model"]) == ("base", "gray:shaken")
-    assert "mCE 2.000 beside gray:shaken, on the 3 pictures of both runs; left out: 1 of this one and 1 of base\n" in (
-        outcome.out
-    )
+    verdict = "mCE 2.000 beside gray:shaken, on the 3 pictures of both runs; left out: 1 of this one and 1 of base\n"
+    assert verdict in outcome.out
     page = (tmp_path / "out" / "report.html").read_text()
     assert "<td>cape_town_fog</td><td>2.000</td>" in page
     assert "<td>mCE</td><td>2.000</td>" in page
@@ -123,14 +113,14 @@ def test_a_run_beside_a_base_states_its_corruption_errors_and_the_pictures_left_
     without = (tmp_path / "out" / "scores.jsonl").read_bytes()
     assert call(*RUN, FOG, "model=gray:brightness", "out=out").code == 0  # continues
     assert (tmp_path / "out" / "scores.jsonl").read_bytes() == without
-    assert "corruption_error" not in results(tmp_path / "out")
+    assert "corruption_error" not in results()
     assert "mCE" not in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_base_without_an_error_gives_no_number_and_says_so(call, tmp_path, frames):
+def test_a_base_without_an_error_gives_no_number_and_says_so(call, results, tmp_path, frames):
     assert call(*RUN, "scene=cape_town_fog", "model=gray:blind", "out=base").code == 0
     outcome = call(*RUN, "scene=cape_town_fog", "model=gray:brightness", "out=out", "base=base")
-    of_both = results(tmp_path / "out")["corruption_error"]
+    of_both = results()["corruption_error"]
     assert of_both["scenes"] == {"cape_town_fog": None}
     assert of_both["mean"] is None
     assert "warning: there is no mCE, as the base makes no error in cape_town_fog\n" in outcome.err
@@ -221,9 +211,8 @@ def test_a_base_of_another_version_is_said(call, tmp_path, frames):
     state_versions(tmp_path / "base", torchrefract="0.1.9", torch=torch.__version__)
     outcome = call(*RUN, "scene=cheap_dashcam", "model=gray:brightness", "out=out", "base=base")
     assert outcome.code == 0
-    assert (
-        f"warning: base was run with torchrefract 0.1.9, this is {torchrefract.__version__}: its pictures may differ\n"
-    ) in outcome.err
+    version = torchrefract.__version__
+    assert f"warning: base was run with torchrefract 0.1.9, this is {version}: its pictures may differ\n" in outcome.err
 
 
 # --- columns of the table
@@ -240,7 +229,9 @@ def test_a_base_of_another_version_is_said(call, tmp_path, frames):
         ("boxes", ("labels=labels", "score=gray:half"), "gray:half"),
     ],
 )
-def test_each_line_of_the_table_names_its_metric_seed_and_versions(call, tmp_path, frames, model, words, metric):
+def test_each_line_of_the_table_names_its_metric_seed_and_versions(
+    call, results, tmp_path, frames, model, words, metric
+):
     (tmp_path / "labels").mkdir()
     for path in frames.iterdir():
         (tmp_path / "labels" / f"{path.stem}.txt").write_text(f"1 {19 / 64} {19 / 36} {22 / 64} {22 / 36}\n")
@@ -256,18 +247,17 @@ def test_each_line_of_the_table_names_its_metric_seed_and_versions(call, tmp_pat
         for row in rows:
             assert (row["metric"], row["seed"]) == (metric, "3")
             assert (row["torchrefract"], row["torch"]) == (torchrefract.__version__, torch.__version__)
-        assert results(tmp_path / "out")["about"]["metric"] == metric
+        assert results()["about"]["metric"] == metric
 
 
 # --- the camera and the horizon of the frames
 
 
-def test_the_camera_and_the_horizon_are_those_of_each_scene(call, tmp_path, frames):
+def test_the_camera_and_the_horizon_are_those_of_each_scene(call, results, tmp_path, frames):
     picture = np.random.default_rng(0).integers(0, 255, (36, 64, 3), np.uint8)
-    cv2.imwrite(str(frames / "0.png"), np.linspace(0.2, 1, 36)[:, None, None] * picture)
+    save_picture(frames / "0.png", (np.linspace(0.2, 1, 36)[:, None, None] * picture).astype(np.uint8))
     write_opencv(tmp_path / "my camera=1.yaml", CAMERA)
-    words = ("robustness.__main__", "data=frames", "score=gray:darkness", "severity=4", "limit=1")
-    words += ("model=gray:brightness",)
+    words = (*RUN[:-1], "severity=4", "limit=1", "model=gray:brightness")
     assert call(*words, "out=out", "camera=my camera=1.yaml", "horizon=0.4").code == 0
     assert call(*words, "out=without").code == 0
     given, without = ({s: of[0] for s, _, of in scores(tmp_path / out)["0.png"]} for out in ("out", "without"))
@@ -280,15 +270,13 @@ def test_the_camera_and_the_horizon_are_those_of_each_scene(call, tmp_path, fram
         assert score == pytest.approx(1 - degraded.image.mean().item(), abs=1e-6), scene
     same = {scene for scene in given if given[scene] == without[scene]}
     assert same == {"cheap_dashcam"}  # a lens of its own, and no horizon
-    about = results(tmp_path / "out")["about"]
+    about = results()["about"]
     assert (about["camera"]["fx"], about["camera"]["width"], about["horizon"]) == (80.0, 64, 0.4)
 
 
 def test_pictures_that_a_tag_turns_are_warned_of_beside_a_camera(call, tmp_path, frames):
     write_opencv(tmp_path / "camera.yaml", CAMERA)
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    Image.new("RGB", (64, 36)).save(frames / "0.jpg", exif=exif)
+    save_turned(frames / "0.jpg", np.zeros((36, 64, 3), np.uint8), 3)
     words = (*RUN, "scene=cheap_dashcam", "model=gray:brightness", "limit=1")
     for out, camera in (("with", ["camera=camera.yaml"]), ("without", [])):
         outcome = call(*words, *camera, f"out={out}")
@@ -306,10 +294,8 @@ def test_a_run_is_not_continued_with_another_camera_or_horizon(call, tmp_path, f
     message = call(*words, "out=out").message
     assert message.startswith("out must be a folder of the same settings, got one with camera={'width': 64, ")
     assert "'fx': 80.0" in message
-    assert (
-        "base must be a run on the same data with the same settings, got one with camera={"
-        in call(*words, "out=o2", "base=out").message
-    )
+    message = call(*words, "out=o2", "base=out").message
+    assert "base must be a run on the same data with the same settings, got one with camera={" in message
 
 
 @pytest.mark.parametrize(
@@ -368,7 +354,7 @@ def test_the_report_draws_the_classes_of_the_clean_and_the_degraded_picture_side
     clean = np.full((200, 400, 3), 40, np.uint8)
     clean[:, 200:] = 140
     clean[:, :100] = 250
-    cv2.imwrite(str(frames / "0.png"), clean)
+    save_picture(frames / "0.png", clean)
     words = ("robustness.__main__", "data=frames", "model=gray:pixels", "out=out", "severity=5", "worst=1")
     assert call(*words, "scene=cape_town_fog").code == 0
     page = (tmp_path / "out" / "report.html").read_text()

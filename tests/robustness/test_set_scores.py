@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import save_picture
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from torchmetrics.classification import MulticlassJaccardIndex
@@ -40,25 +40,22 @@ def detect(images):
 
 
 @pytest.fixture
-def frames(tmp_path, monkeypatch) -> Path:
+def frames(tmp_path, write_module) -> Path:
     """Write six pictures with squares of two classes, their labels, and a model with errors."""
-    folder = tmp_path / "frames"
-    folder.mkdir()
     rng, images, rows = np.random.default_rng(0), [], []
     for i in range(6):
         picture = np.full((96, 160, 3), 90, np.uint8)
         for x in range(10, 140, 45):
             name, left, top, side = rng.integers((1, x, 10, 14), (3, x + 12, 60, 24)).tolist()
-            picture[top : top + side, left : left + side] = (90, 90, 255) if name == 1 else (90, 255, 90)
+            picture[top : top + side, left : left + side] = (255, 90, 90) if name == 1 else (90, 255, 90)
             rows.append({"image_id": i, "bbox": [left, top, side, side], "category_id": name})
-        cv2.imwrite(str(folder / f"{i}.png"), picture)
+        save_picture(tmp_path / "frames" / f"{i}.png", picture)
         images.append({"id": i, "file_name": f"{i}.png", "height": 96, "width": 160})
     rows = [{"id": i + 1, "area": row["bbox"][2] ** 2, "iscrowd": 0} | row for i, row in enumerate(rows)]
     categories = [{"id": 1, "name": "red"}, {"id": 2, "name": "green"}]
     (tmp_path / "coco.json").write_text(json.dumps({"images": images, "annotations": rows, "categories": categories}))
-    (tmp_path / "squares.py").write_text(MODEL)
-    monkeypatch.syspath_prepend(tmp_path)
-    return folder
+    write_module("squares", MODEL)
+    return tmp_path / "frames"
 
 
 def coco_scores(folder: Path, labels: Path) -> dict[str, float]:
@@ -77,11 +74,12 @@ def coco_scores(folder: Path, labels: Path) -> dict[str, float]:
     return {"mAP": evaluation.stats[0], "mAP50": evaluation.stats[1]}
 
 
-def test_the_map_of_all_images_is_that_of_pycocotools_on_written_pictures_and_labels(call, tmp_path, frames):
+def test_the_map_of_all_images_is_that_of_pycocotools_on_written_pictures_and_labels(
+    call, score, results, tmp_path, frames
+):
     words = ("labels=coco.json", "scene=cheap_dashcam")
-    outcome = call("robustness.__main__", "model=squares:detect", "data=frames", "out=out", *words, "severity=[3]")
-    assert outcome.code == 0
-    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert score("model=squares:detect", *words, "severity=[3]").code == 0
+    results = results()
     expected = coco_scores(frames, tmp_path / "coco.json")
     assert 0.1 < expected["mAP"] < expected["mAP50"] < 0.95
     assert {name: of["clean"] for name, of in results["set_scores"].items()} == pytest.approx(expected, abs=1e-6)

@@ -2,9 +2,9 @@ import math
 
 import pytest
 import torch
+from targets import boxes_of
 from torch import Tensor, nn
 from torch.testing import assert_close
-from torchvision import tv_tensors
 
 from torchrefract import Compose, LensDistortion, LensFlare, OneOf, ThinPlateSpline, UniformFog, Vignetting, warp_labels
 from torchrefract.cameras.camera import Camera
@@ -82,10 +82,7 @@ def test_each_sample_is_searched_alone(frames, change):
 
 
 def test_labels_move_along_in_each_step(frames):
-    boxes = tv_tensors.BoundingBoxes(  # pyright: ignore[reportCallIssue]  # torchvision's overloads
-        torch.tensor([[20.0, 10, 40, 30]]), format="XYXY", canvas_size=(45, 80)
-    )
-    target = {"boxes": boxes, "labels": torch.tensor([1])}
+    target = {"boxes": boxes_of([[20.0, 10, 40, 30]], (45, 80)), "labels": torch.tensor([1])}
     seen = []
 
     def loss(image: Tensor, moved: dict) -> Tensor:

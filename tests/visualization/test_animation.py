@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from pictures import load_clip, load_frames
+from PIL import Image, ImageSequence
 from torch import Tensor
 
 import torchrefract as tr
@@ -51,17 +52,7 @@ def displayed(image: Tensor) -> np.ndarray:
 
 def decoded(path: Path) -> np.ndarray:
     """Return the pictures of a file, (T, height, width, 3)."""
-    if path.suffix == ".mp4":
-        video, frames = cv2.VideoCapture(str(path)), []
-        while (result := video.read())[0]:
-            frames.append(result[1][..., ::-1])
-        return np.stack(frames)
-    with Image.open(path) as image:
-        frames = []
-        for t in range(getattr(image, "n_frames", 1)):
-            image.seek(t)
-            frames.append(np.asarray(image.convert("RGB")))
-        return np.stack(frames)
+    return np.stack(load_clip(path) if path.suffix == ".mp4" else load_frames(path))
 
 
 def cell(pictures: np.ndarray, animation: Animation, i: int, column: int) -> np.ndarray:
@@ -114,10 +105,8 @@ def test_a_map_has_one_scale_in_all_frames(frame):
         valid = displayed(warped.valid.float().expand(-1, 3, -1, -1)) > 0
         flow = displayed(flow_to_rgb(warped.flow, max_px=flow_top))
         assert np.array_equal(cell(picture, animation, 0, 1)[valid], flow[valid])
-        assert np.array_equal(
-            cell(picture, animation, 1, 1), displayed(transmission_to_rgb(flare.intensity / intensity_top))
-        )
-        assert np.array_equal(cell(picture, animation, 2, 1), displayed(transmission_to_rgb(fog.transmission)))
+        for i, light in ((1, flare.intensity / intensity_top), (2, fog.transmission)):
+            assert np.array_equal(cell(picture, animation, i, 1), displayed(transmission_to_rgb(light)))
         if t in (0, 2, 4, 6, 8):  # the frames that decide the scale
             assert warped.flow.norm(dim=1)[warped.valid[:, 0]].max() <= flow_top
             assert flare.intensity.max() <= intensity_top
@@ -155,10 +144,9 @@ def test_fog_takes_the_depth_of_the_frames(frame):
 def durations_ms(path: Path) -> list[float]:
     with Image.open(path) as image:
         times = []
-        for t in range(getattr(image, "n_frames", 1)):
-            image.seek(t)
-            image.load()  # WebP knows the duration of a frame once it is decoded
-            times.append(image.info["duration"])
+        for frame in ImageSequence.Iterator(image):
+            frame.load()  # WebP knows the duration of a frame once it is decoded
+            times.append(frame.info["duration"])
         assert image.info["loop"] == 0
         return times
 

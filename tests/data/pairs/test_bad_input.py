@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from stores import digests
 
 import torchrefract
 from torchrefract.data.pairs.dataset import PairedFolder
@@ -67,12 +68,12 @@ def test_a_license_and_a_scene_are_required(call, words):
         assert message in call("generate", *without).message
 
 
-def test_a_folder_of_another_configuration_raises_with_the_differences(call, words, tmp_path, sums):
+def test_a_folder_of_another_configuration_raises_with_the_differences(call, words, tmp_path):
     assert call("generate", *words("out", "count=2")).code == 0
-    before = sums(tmp_path / "out")
+    before = digests(tmp_path / "out")
     message = call("generate", *words("out", "count=2", "seed=5", "scene.severity=2")).message
     assert "scene.severity is 3 there and 2 here, seed is 0 there and 5 here" in message
-    assert sums(tmp_path / "out") == before
+    assert digests(tmp_path / "out") == before
 
 
 def test_an_output_folder_must_be_new_and_lie_outside_of_the_source(call, words, frames, tmp_path):
@@ -120,7 +121,7 @@ def test_a_disk_that_is_too_small_raises_before_a_pair_is_written(call, words, d
     assert not list(folder.rglob("*.png"))
 
 
-def test_a_disk_that_becomes_full_keeps_complete_pairs_and_the_run_continues(call, words, disk, sums, monkeypatch):
+def test_a_disk_that_becomes_full_keeps_complete_pairs_and_the_run_continues(call, words, disk, monkeypatch):
     folder = disk("size=256k")
     monkeypatch.setattr(
         "torchrefract.cli.generation._check_disk", lambda *_: None
@@ -135,7 +136,7 @@ def test_a_disk_that_becomes_full_keeps_complete_pairs_and_the_run_continues(cal
     subprocess.run(["mount", "-o", "remount,size=8m", folder], check=True)
     assert call("generate", *words(folder / "out")).code == 0
     assert call("generate", *words("out")).code == 0
-    assert sums(folder / "out") == sums(Path("out"))
+    assert digests(folder / "out") == digests(Path("out"))
 
 
 def test_an_interrupted_run_prints_how_to_continue(call, words, monkeypatch):

@@ -122,7 +122,7 @@ def test_npz_and_safetensors_hold_maps_in_full_precision(call, words, rows, fram
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # webdataset does not close its tars,
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # and pytest wraps the same warning
-def test_webdataset_reads_tars(call, words, rows, sums, tmp_path):
+def test_webdataset_reads_tars(call, words, rows, tmp_path):
     assert call("generate", *words("tars", "count=7", "tar=3")).code == 0
     assert call("generate", *words("files", "count=7")).code == 0
     urls = sorted(str(path) for path in (tmp_path / "tars" / "tars").glob("*.tar"))

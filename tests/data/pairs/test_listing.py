@@ -32,7 +32,7 @@ def scans(monkeypatch) -> list[Path]:
     return folders
 
 
-def test_shards_and_later_runs_share_one_scan(call, words, frames, tmp_path, scans, sums):
+def test_shards_and_later_runs_share_one_scan(call, words, frames, tmp_path, scans):
     for shard in (1, 0):
         assert call("generate", *words("out", "shards=2", f"shard={shard}")).code == 0
     assert "12 frames, as listed in out/sources.parquet" in call("generate", *words("out")).out

@@ -4,14 +4,14 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from processes import running
+from stores import digests
 
-ROOT = Path(__file__).parents[3]
 COUNT = 300
 
 
@@ -23,24 +23,15 @@ def tar(request) -> str:
 
 
 @pytest.fixture(scope="module")
-def complete(tmp_path_factory, words, tar) -> Path:
+def complete(tmp_path_factory, spawn, words, tar) -> Path:
     """Return a set made by the local engine."""
     out = tmp_path_factory.mktemp("complete") / "out"
-    run(words(out, f"count={COUNT}", f"tar={tar}"), workers=0)
+    outcome = spawn(*GENERATE, *words(out, f"count={COUNT}", f"tar={tar}"), cwd=out.parent)
+    assert outcome.code == 0, outcome.err
     return out
 
 
-def command(words: tuple[str, ...], *, workers: int, engine: str = "local") -> list[str]:
-    return [sys.executable, "-m", "torchrefract.generate", *words, f"workers={workers}", f"engine={engine}"]
-
-
-def run(words: tuple[str, ...], **options) -> str:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(
-        command(words, **options), env=environment, capture_output=True, text=True, check=False, timeout=500
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+GENERATE = ("-m", "torchrefract.generate")
 
 
 def actors() -> Iterator[int]:
@@ -55,18 +46,17 @@ def actors() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_actors_write_the_bytes_of_the_local_engine(tmp_path, words, sums, complete, tar, workers):
-    options = words(tmp_path / "out", f"count={COUNT}", f"tar={tar}")
-    assert f"{COUNT} in total" in run(options, workers=workers, engine="ray")
-    assert sums(tmp_path / "out") == sums(complete)
+def test_actors_write_the_bytes_of_the_local_engine(tmp_path, spawn, words, complete, tar, workers):
+    options = words(tmp_path / "out", f"count={COUNT}", f"tar={tar}", "engine=ray", workers=workers)
+    assert f"{COUNT} in total" in spawn(*GENERATE, *options, cwd=tmp_path).out
+    assert digests(tmp_path / "out") == digests(complete)
 
 
-def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete, tar):
+def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, complete, tar):
     out = tmp_path / "out"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    options = command(words(out, f"count={COUNT}", f"tar={tar}"), workers=2, engine="ray")
+    options = words(out, f"count={COUNT}", f"tar={tar}", "engine=ray", workers=2)
     killed = list[int]()
-    with subprocess.Popen(options, env=environment, stdout=subprocess.PIPE, text=True) as process:
+    with running(*GENERATE, *options, stdout=subprocess.PIPE) as process:
         end = time.monotonic() + 300
         while process.poll() is None and not killed and time.monotonic() < end:
             if len(list(out.glob("pairs/*/*.clean.png"))) > COUNT // 4 or len(list(out.glob("tars/0*"))) > 2:
@@ -77,7 +67,7 @@ def test_an_actor_that_is_killed_costs_no_pair(tmp_path, words, sums, complete, 
         output, _ = process.communicate(timeout=300)
     assert killed
     assert f"{COUNT} pairs made, {COUNT} in total" in output
-    assert sums(out) == sums(complete)
+    assert digests(out) == digests(complete)
 
 
 def test_ray_without_actors_raises(call, words):

@@ -2,23 +2,13 @@
 
 import os
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import running, wait_for
+from stores import digests
 
-ROOT = Path(__file__).parents[3]
 COUNT = 16
-
-
-def start(*words: str) -> subprocess.Popen[str]:
-    """Start the command in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "torchrefract.generate", *words]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,35 +47,25 @@ def workers_of(process: int) -> set[str]:
     return set(descendants(process)) - set(children_of(process))
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def without_manifests(files: dict[str, str]) -> dict[str, str]:
     """The checksums of a set without its manifests, of which each shard has one, with a copy of config.json."""
     return {name: value for name, value in files.items() if not name.startswith(("manifest", "config-"))}
 
 
-def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, sums, complete):
+def test_a_killed_run_continues_to_the_same_bytes_with_another_number_of_workers(call, tmp_path, words, complete):
     out, arguments = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
-    run = start(*arguments, "workers=2")
-    # Kill it after two pairs, somewhere in a later one.
-    wait_for(lambda: run.poll() is not None or len(list(out.rglob("*.png"))) > 8)
-    processes = descendants(run.pid)
-    run.send_signal(signal.SIGKILL)
-    run.communicate()
+    with running("-m", "torchrefract.generate", *arguments, "workers=2") as run:
+        # Kill it after two pairs, somewhere in a later one.
+        wait_for(lambda: len(list(out.rglob("*.png"))) > 8, run)
+        processes = descendants(run.pid)
     # A worker that outlived the run could write at the same time as the next run.
     wait_for(lambda: not any(is_running(process) for process in processes))
     assert "exist already" in call("generate", *arguments).out
-    assert sums(out) == sums(complete)
+    assert digests(out) == digests(complete)
 
 
 def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
     out = tmp_path / "out"
-    run = start(*words(out, "count=4000", "workers=1"))
     seen = dict[str, int]()
 
     def at_work() -> list[str]:
@@ -93,16 +73,17 @@ def test_a_killed_worker_stops_the_run_with_a_message(tmp_path, words):
         files, workers = len(list(out.rglob("*.png"))), workers_of(run.pid)
         return [worker for worker in workers if files > seen.setdefault(worker, files) + 8]
 
-    wait_for(lambda: run.poll() is not None or bool(at_work()))
-    for worker in at_work():
-        os.kill(int(worker), signal.SIGKILL)
-    _, err = run.communicate(timeout=100)
+    with running("-m", "torchrefract.generate", *words(out, "count=4000", "workers=1")) as run:
+        wait_for(at_work, run)
+        for worker in at_work():
+            os.kill(int(worker), signal.SIGKILL)
+        _, err = run.communicate(timeout=100)
     assert run.returncode == 1, err
     assert "\nerror: workers must fit the memory, got 1 of which one was killed" in "\n" + err
 
 
 @pytest.mark.parametrize("way", ["jobs", "multirun", "torchrun"])
-def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, complete, monkeypatch, way):
+def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, complete, monkeypatch, way):
     out, options = tmp_path / "out", words(tmp_path / "out", f"count={COUNT}")
     if way == "multirun":
         assert call("generate", "-m", *options, "shards=2", "shard=0,1").code == 0
@@ -111,7 +92,7 @@ def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, co
             monkeypatch.setenv("WORLD_SIZE", "2")
             monkeypatch.setenv("RANK", str(shard))
         assert call("generate", *options, *(("shards=2", f"shard={shard}") if way == "jobs" else ())).code == 0
-    assert without_manifests(sums(out)) == without_manifests(sums(complete))
+    assert without_manifests(digests(out)) == without_manifests(digests(complete))
     names = {path.name for path in out.glob("manifest*")}
     assert names == {"manifest-00000-of-00002.jsonl", "manifest-00001-of-00002.jsonl"}
     lines, expected = (
@@ -121,36 +102,36 @@ def test_shards_make_the_same_files_in_any_order(call, tmp_path, words, sums, co
     assert lines == expected
 
 
-def test_shards_make_the_same_tars(call, tmp_path, words, sums):
+def test_shards_make_the_same_tars(call, tmp_path, words):
     for name, shards in (("one", 1), ("two", 2)):
         for shard in range(shards):
             options = ("count=5", "tar=2", f"shards={shards}", f"shard={shard}")
             assert call("generate", *words(name, *options)).code == 0
-    one, two = sums(tmp_path / "one"), sums(tmp_path / "two")
+    one, two = digests(tmp_path / "one"), digests(tmp_path / "two")
     assert without_manifests(one) == without_manifests(two)
     assert sum(name.startswith("tars/") for name in one) == 3
 
 
 @pytest.mark.parametrize("tar", ["null", "4"])
-def test_verify_makes_damaged_pairs_again(call, tmp_path, words, sums, tar):
+def test_verify_makes_damaged_pairs_again(call, tmp_path, words, tar):
     arguments = words("out", "count=6", f"tar={tar}")
     assert call("generate", *arguments).code == 0
     out = tmp_path / "out"
-    before = sums(out)
+    before = digests(out)
     altered = out / ("tars/00000000.tar" if tar == "4" else "pairs/00000/00000002.flow.png")
     data = bytearray(altered.read_bytes())
     data[1500] ^= 1
     altered.write_bytes(data)
     assert "6 pairs exist already" in call("generate", *arguments).out
     assert "made again" in call("generate", *arguments, "verify=true").out
-    assert sums(out) == before
+    assert digests(out) == before
 
 
-def test_truncated_and_missing_files_are_detected_by_size(call, tmp_path, words, sums):
+def test_truncated_and_missing_files_are_detected_by_size(call, tmp_path, words):
     arguments = words("out", "count=8")
     assert call("generate", *arguments).code == 0
     out = tmp_path / "out"
-    before = sums(out)
+    before = digests(out)
     os.truncate(out / "pairs/00000/00000001.clean.png", 10)
     (out / "pairs/00000/00000005.valid.png").unlink()
     with (out / "manifest.jsonl").open("a") as manifest:
@@ -158,16 +139,16 @@ def test_truncated_and_missing_files_are_detected_by_size(call, tmp_path, words,
     outcome = call("generate", *arguments)
     assert "6 pairs exist already" in outcome.out
     assert ": 2 pairs made, 8 in total" in outcome.out
-    assert sums(out) == before
+    assert digests(out) == before
 
 
-def test_a_larger_count_adds_pairs_and_keeps_the_others(call, tmp_path, words, sums):
+def test_a_larger_count_adds_pairs_and_keeps_the_others(call, tmp_path, words):
     assert call("generate", *words("out", "count=12")).code == 0
-    before = {name: value for name, value in sums(tmp_path / "out").items() if name.startswith("pairs/")}
+    before = {name: value for name, value in digests(tmp_path / "out").items() if name.startswith("pairs/")}
     outcome = call("generate", *words("out", "count=15"))
     assert "each frame is used up to 2 times, with new keys" in outcome.out
     assert ": 3 pairs made, 15 in total" in outcome.out
-    after = sums(tmp_path / "out")
+    after = digests(tmp_path / "out")
     assert before.items() <= after.items()
     added = set(after) - set(before)
     assert len({name for name in added if name.startswith("pairs/")}) == 3 * 6

@@ -1,24 +1,17 @@
 """Sources and sets in object stores: the same bytes as on disk, also after a kill, and errors of one line."""
 
-import hashlib
-import os
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from processes import running, wait_for
+from stores import digests, failing_writes
 
 from torchrefract._io import as_path
 from torchrefract.data.media import write_video
 from torchrefract.data.pairs import PairedFolder, PairStream
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -28,48 +21,29 @@ def memory(memory, frames) -> MemoryFileSystem:
     return memory
 
 
-def sums_in(store: Any, root: str) -> dict[str, str]:
-    """Return the checksum of each file of a set."""
-    return {path.split(root)[1]: hashlib.sha256(store.cat_file(path)).hexdigest() for path in store.find(root)}
-
-
-def sums_on_disk(sums: Callable[[Path], dict[str, str]], out: Path) -> dict[str, str]:
-    return {f"/{name}": value for name, value in sums(out).items()}
-
-
 @pytest.mark.parametrize("tar", ["null", "5"])
-def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, sums, tmp_path, tar):
+def test_a_set_in_a_store_has_the_bytes_of_one_on_disk(call, words, memory, tmp_path, tar):
     options = ("count=6", f"tar={tar}")
-    assert call("generate", *words("memory://out", *options, source="memory://frames")).code == 0
+    in_store = words("memory://out", *options, source="memory://frames")
+    assert call("generate", *in_store).code == 0
     assert call("generate", *words("file://" + str(tmp_path / "out"), *options)).code == 0
-    assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
-    assert (
-        ": 0 pairs made, 6 in total" in call("generate", *words("memory://out", *options, source="memory://frames")).out
-    )
+    assert digests("memory://out") == digests(tmp_path / "out")
+    assert ": 0 pairs made, 6 in total" in call("generate", *in_store).out
     pairs = PairedFolder("memory://out")
     assert (pairs[3].clean == PairedFolder(tmp_path / "out")[3].clean).all()
 
 
-def test_a_stopped_run_in_a_store_continues(call, words, memory, monkeypatch, sums, tmp_path):
+def test_a_stopped_run_in_a_store_continues(call, words, memory, monkeypatch, tmp_path):
     monkeypatch.setattr("torchrefract.data.pairs.manifest._PART_SECONDS", -1.0)
-    put, written = memory.put_file, list[str]()
-
-    def stop(source: str, target: str, **more: Any) -> None:
-        written.append(target)
-        if target.endswith("00000007.flow.png"):
-            raise KeyboardInterrupt
-        put(source, target, **more)
-
     options = words("memory://out", source="memory://frames")
-    with monkeypatch.context() as patch:
-        patch.setattr(MemoryFileSystem, "put_file", lambda _, *names, **more: stop(*names, **more))
+    with failing_writes(KeyboardInterrupt(), suffix="00000007.flow.png"):
         assert call("generate", *options).code == 130
     assert len(memory.glob("/out/manifest.0*.jsonl")) == 7  # a file of rows for each time, as after a kill
     outcome = call("generate", *options)
     assert "7 pairs exist already" in outcome.out
     assert ": 5 pairs made, 12 in total" in outcome.out
     assert call("generate", *words("out")).code == 0
-    assert sums_in(memory, "/out") == sums_on_disk(sums, tmp_path / "out")
+    assert digests("memory://out") == digests(tmp_path / "out")
 
 
 def test_shards_in_a_store_keep_the_rows_of_one_another(call, words, memory, monkeypatch):
@@ -83,12 +57,9 @@ def test_shards_in_a_store_keep_the_rows_of_one_another(call, words, memory, mon
     assert len(PairedFolder("memory://out")) == 4
 
 
-def test_a_store_that_denies_writing_is_one_line(call, words, memory, monkeypatch):
-    def deny(*_: Any, **__: Any) -> None:
-        raise PermissionError("Access Denied")
-
-    monkeypatch.setattr(MemoryFileSystem, "put_file", deny)
-    message = call("generate", *words("memory://out", source="memory://frames")).message
+def test_a_store_that_denies_writing_is_one_line(call, words, memory):
+    with failing_writes(PermissionError("Access Denied")):
+        message = call("generate", *words("memory://out", source="memory://frames")).message
     assert message == "out must be a folder that can be written to, got memory://out (Permission denied)"
 
 
@@ -107,18 +78,10 @@ def test_a_name_that_vanishes_from_a_store_is_named_and_made_by_the_next_run(cal
 
 
 @pytest.mark.parametrize("times", [2, 100])
-def test_a_throttled_request_is_tried_again_with_a_limit(call, words, memory, monkeypatch, times):
-    put, failures = memory.put_file, list[str]()
-
-    def throttle(_: Any, source: str, target: str, **more: Any) -> None:
-        if target.endswith("00000003.flow.png") and len(failures) < times:
-            failures.append(target)
-            raise OSError(16, "Please reduce your request rate")
-        put(source, target, **more)
-
+def test_a_throttled_request_is_tried_again_with_a_limit(call, words, memory, times):
     options = words("memory://out", source="memory://frames")
-    with monkeypatch.context() as patch:
-        patch.setattr(MemoryFileSystem, "put_file", throttle)
+    error = OSError(16, "Please reduce your request rate")
+    with failing_writes(error, suffix="00000003.flow.png", times=times):
         outcome = call("generate", *options)
     lines = [line for line in outcome.err.splitlines() if line.endswith("trying again in 0 s")]
     assert lines[0].startswith("memory://out/pairs/00000/00000003.flow.png: Please reduce your request rate; trying")
@@ -151,13 +114,15 @@ def test_the_name_of_a_folder_in_a_store_is_no_pattern(call, words, memory):
     memory.copy("/sets/1", "/sets/a-b", recursive=True)
     memory.copy("/sets/1", "/sets/run 1", recursive=True)
     for name in ("run [1]", "a?b", "*", "ü #1 = {x}"):
-        before = sums_in(memory, "/sets")
+        before = digests("memory://sets")
         options = words(f"memory://sets/{name}", "count=2", source="memory://frames")
         assert ": 2 pairs made, 2 in total; see" in call("generate", *options).out
         assert ": 0 pairs made, 2 in total; see" in call("generate", *options).out
         assert ": 2 of 2 pairs" in call("merge", f"out=memory://sets/{name}").out
         assert len(PairedFolder(f"memory://sets/{name}")) == 2
-        assert {path: value for path, value in sums_in(memory, "/sets").items() if f"/{name}/" not in path} == before
+        assert {
+            path: data for path, data in digests("memory://sets").items() if not path.startswith(f"{name}/")
+        } == before
         memory.rm(f"/sets/{name}", recursive=True)
 
 
@@ -193,22 +158,21 @@ def test_videos_are_read_from_a_store(call, words, memory, tmp_path):
 
 @pytest.mark.parametrize(("protocol", "stop"), [("s3", signal.SIGKILL), ("gs", signal.SIGTERM)])
 def test_a_run_in_a_bucket_that_is_killed_continues_to_the_bytes_on_disk(
-    call, words, frames, sums, tmp_path, request, protocol, stop
+    call, words, frames, tmp_path, request, protocol, stop
 ):
-    server, bucket = request.getfixturevalue(protocol), f"{protocol}://bucket"
+    request.getfixturevalue(protocol)
+    bucket = f"{protocol}://bucket"
     store: Any = as_path(bucket)
     store.fs.put(str(frames), "bucket/frames", recursive=True)
     options = words(f"{bucket}/out", "tar=2", source=f"{bucket}/frames")
-    command = [sys.executable, "-m", "torchrefract.generate", *options, "workers=1"]
-    with subprocess.Popen(command, env=os.environ | server | {"PYTHONPATH": str(ROOT)}) as run:
-        end = time.monotonic() + 120
-        while run.poll() is None and time.monotonic() < end and not store.fs.glob("bucket/out/tars/*"):
-            time.sleep(0.02)
+    with running("-m", "torchrefract.generate", *options, "workers=1") as run:
+        wait_for(lambda: store.fs.glob("bucket/out/tars/*"), run)
         run.send_signal(stop)
+        run.communicate()
     assert run.returncode == -stop
     assert call("generate", *options).code == 0
     assert call("generate", *words("out", "tar=2")).code == 0
-    assert sums_in(store.fs, "bucket/out") == sums_on_disk(sums, tmp_path / "out")
+    assert digests(f"{bucket}/out") == digests(tmp_path / "out")
     keys = [row.key for row in PairedFolder(f"{bucket}/out").rows()]
     assert [int(pair.key) for pair in PairStream(f"{bucket}/out")] == keys
     assert len(keys) == 12

@@ -30,7 +30,6 @@ import itertools
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,6 +110,12 @@ def board_from_entry(entry: Mapping[str, Any]) -> Board:
     return Chessboard(squares=f"{columns + 1}x{rows + 1}", square_mm=1000 * entry.get("square_m", 0.025))
 
 
+def camera_from_entry(entry: Mapping[str, Any], size: tuple[int, int]) -> Camera:
+    """Create the camera of (width, height) px that a calibration in reference.json describes."""
+    pinhole = {name: entry[name] for name in ("fx", "fy", "cx", "cy")}
+    return Camera(width=size[0], height=size[1], **pinhole, coefficients=tuple(entry["dist_k1k2p1p2k3"]))
+
+
 def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow:
     """Calibrate with the pictures of a folder, with this library and with OpenCV alone."""
     board, size = board_from_entry(entry), (entry["image_size"][0], entry["image_size"][1])
@@ -145,8 +150,7 @@ def measure_board(name: str, entry: Mapping[str, Any], folder: Path) -> BoardRow
 
 def edge_distance(camera: Camera, published: Mapping[str, Any]) -> float:
     """Return the largest distance over the frame, px, between where a camera and a published one show a ray."""
-    numbers = {name: published[name] for name in ("fx", "fy", "cx", "cy")}
-    other = replace(camera, **numbers, coefficients=tuple(published["dist_k1k2p1p2k3"]), model="opencv")
+    other = camera_from_entry(published, (camera.width, camera.height))
     pixels = other.grid(_EDGE_GRID)
     rays, has_ray, _ = other.unproject(pixels)
     shown, valid, _ = camera.project(rays)

@@ -12,9 +12,8 @@ import argparse
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -75,8 +74,7 @@ PHOTOMETRIC: dict[str, Callable[[], Effect]] = {
 }
 
 
-@dataclass(frozen=True)
-class Errors:
+class Errors(NamedTuple):
     """The largest relative errors of the derivatives of one function; None where PyTorch raises."""
 
     name: str
@@ -88,14 +86,11 @@ class Errors:
     @property
     def largest(self) -> float:
         """Return the largest of them."""
-        return max(
-            value for value in (self.forward, self.reverse, self.backward_twice, self.hessian) if value is not None
-        )
+        return max(value for value in self[1:] if value is not None)
 
     def as_row(self) -> str:
         """Format a row of the table."""
-        values = (self.forward, self.reverse, self.backward_twice, self.hessian)
-        return f"{self.name:34}" + "".join(f"{'raises' if value is None else f'{value:.1e}':>16}" for value in values)
+        return f"{self.name:34}" + "".join(f"{'raises' if value is None else f'{value:.1e}':>16}" for value in self[1:])
 
 
 def main() -> None:

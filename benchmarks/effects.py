@@ -20,6 +20,7 @@ from timing import (
     GRID_SAMPLE,
     PHOTOMETRIC,
     RESULTS,
+    ROUGH_TURBULENCE,
     TOLERANCE_PX,
     WARPS,
     Bar,
@@ -53,9 +54,7 @@ ROLLING_SHUTTER = "rolling shutter"
 OTHER_WARPS: dict[str, Callable[..., Any]] = {
     "default lenses": tr.LensDistortion,
     ROLLING_SHUTTER: tr.RollingShutter,
-    "rough turbulence": partial(
-        tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
-    ),
+    "rough turbulence": ROUGH_TURBULENCE,
     "Gaussian turbulence with depth": partial(WARPS["Gaussian turbulence"], depth=tr.GroundPlaneDepth()),
     "physical turbulence": tr.PhysicalTurbulence,
     "road mirage": tr.RoadMirage,

@@ -23,10 +23,10 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from pytorch_lightning import Callback, LightningModule, Trainer, seed_everything
-from timing import RESULTS, count, size, write_json
+from timing import RESULTS, count, markdown, size, write_json
 
+from torchrefract._io import write_figure
 from torchrefract.data.module import PairData
-from torchrefract.restoration.report import save_figure
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 _SMALL = ("model.network.widths=[32,64,128,128]", "model.lr=0.001", "model.warmup_steps=50", "model.crop=null")
@@ -108,7 +108,7 @@ def main() -> None:
             write_json(files[name], learn(name, data, args))
     curves = {name: json.loads(file.read_text()) for name, file in files.items()}
     print(table(curves, kind))
-    save_figure(plot(curves, kind), args.out / f"{args.task}.png")
+    write_figure(args.out / f"{args.task}.png", plot(curves, kind))
 
 
 def learn(name: str, data: PairData, args: argparse.Namespace) -> list[Point]:
@@ -151,13 +151,13 @@ def _config(name: str, args: argparse.Namespace) -> Any:
 def table(curves: dict[str, list[Point]], kind: Kind) -> str:
     """Format a Markdown table of the last validation of each model."""
     head = ["model", "seconds", "steps", kind.unit, *kind.rivals.values(), "within two standard deviations"]
-    rows = [head, ["---"] * len(head)]
+    rows = []
     for name, points in curves.items():
         last = points[-1]
         cells = [name, f"{last['seconds']:.0f}", f"{last['steps']:.0f}", f"{last[f'val/{kind.score}']:.2f}"]
         cells += [f"{last[f'val/{kind.score}_{rival}']:.2f}" for rival in kind.rivals]
         rows.append([*cells, f"{last['val/coverage']:.1%}" if "val/coverage" in last else ""])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown(head, rows)
 
 
 def plot(curves: dict[str, list[Point]], kind: Kind) -> Figure:

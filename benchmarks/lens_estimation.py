@@ -34,18 +34,19 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
-from calibration import board_from_entry
+from calibration import board_from_entry, camera_from_entry
+from severity import gray_levels
 from table1 import wide_lens
-from timing import RESULTS, count, write_json
+from timing import RESULTS, count, seconds, write_json
 from torch import Tensor
 
 from torchrefract._tensor import to_float, to_uint8
@@ -74,6 +75,7 @@ from torchrefract.fields.rectification import camera_flow
 from torchrefract.presets import cheap_dashcam
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
+from torchrefract.restoration.tasks import Restored
 from torchrefract.warping.flow import resize_flow
 from torchrefract.warping.warp import warp
 
@@ -132,22 +134,11 @@ def to_camera(coefficients: Tensor, size: tuple[int, int]) -> Camera:
     )
 
 
-def calibrated_camera(entry: dict[str, Any], calibration: str) -> Camera:
-    """Create the camera of a calibration in an entry of reference.json."""
-    fit, (width, height) = entry[calibration], entry["image_size"]
-    pinhole = {name: fit[name] for name in ("fx", "fy", "cx", "cy")}
-    return Camera(width=width, height=height, **pinhole, coefficients=tuple(fit["dist_k1k2p1p2k3"]))
-
-
 def shown_at(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Return where the camera shows the pixels of its rectified frame, and which of them it does."""
-    focal, center = (
-        torch.tensor(pair, dtype=torch.float64) for pair in ((camera.fx, camera.fy), (camera.cx, camera.cy))
-    )
-    result = camera.distort((pixels - center) / focal)
-    shown = result.points * focal + center
+    shown, valid, _ = camera.project(camera.without_lens().unproject(pixels).points)
     last = torch.tensor([camera.width - 1, camera.height - 1])
-    return shown, result.valid & (shown >= 0).all(dim=1) & (shown <= last).all(dim=1)
+    return shown, valid & (shown >= 0).all(dim=1) & (shown <= last).all(dim=1)
 
 
 def errors(estimate: Camera, truth: Camera) -> tuple[float, float]:
@@ -164,7 +155,7 @@ def measure(
 ) -> tuple[list[Row], Camera]:
     """Estimate the lens from pools of frames (1, 3, H, W); return the rows and the camera of all frames by lines."""
     size, random = (truth.height, truth.width), np.random.default_rng(0)
-    chains = [find_chains(to_gray(frame[0])) for frame in frames]
+    chains = [find_chains(gray_levels(frame[0])) for frame in frames]
     aspect = truth.width / truth.height
     lenses = torch.stack([radial_lens_of_flow(network.predict(f), aspect=aspect) for f in frames]) if network else None
     rows, camera = [], truth
@@ -200,8 +191,8 @@ def lens_flow(lens: tuple[float, float]) -> tuple[Camera, Tensor]:
     """Return the camera of a lens, relative to the half diagonal, and the flow that shows a part of rendered frames."""
     camera, (height, width) = to_camera(torch.tensor(lens), _RENDERED_SIZE), _RENDERED_SIZE
     y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    pixels, center = torch.stack([x, y], dim=-1).reshape(-1, 2), torch.tensor([camera.cx, camera.cy])
-    rectified = camera.undistort((pixels - center) / camera.fx).points * camera.fx * _SHRINK + center
+    pixels = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    rectified = camera.without_lens(zoom=_SHRINK).project(camera.unproject(pixels).points).points
     return camera, (rectified - pixels).T.reshape(1, 2, height, width).float()
 
 
@@ -240,9 +231,9 @@ def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dic
         def frames() -> Iterator[Tensor]:
             return (frame for _, frame in read_video(clip, range(num_frames)))
 
-        def convert(restore: Callable[[Sequence[Tensor]], list[Tensor]]) -> None:
+        def convert(restore: Callable[[Sequence[Tensor]], list[Restored]]) -> None:
             out = Path(folder, "restored.mp4")
-            convert_video(clip, out, change=lambda views: (pixels_of(restore([view[0]])[0]) for view in views))
+            convert_video(clip, out, change=lambda views: (pixels_of(restore([v[0]])[0].image[0]) for v in views))
 
         cameras: dict[str, Camera] = {}
         for name, network in {"estimate_lens, lines": None, "estimate_lens, both": predict}.items():
@@ -251,10 +242,9 @@ def measure_clip(num_frames: int, restorer: Restorer, predict: Predictor) -> dic
             results[name] = {"frames_per_second": num_frames / (time.process_time() - start)}
             results[name]["error_px"], results[name]["nothing_px"] = errors(cameras[name], lens_flow(RENDERED_LENS)[0])
         pooled = LensRestorer(cameras["estimate_lens, both"])
-        for name, restore in {"restore, each frame": restorer, "restore, pool=lens": pooled}.items():
-            start = time.process_time()
-            convert(restore)
-            results[name] = {"frames_per_second": num_frames / (time.process_time() - start)}
+        for name, restore in {"restore, each frame": restorer.restore, "restore, pool=lens": pooled.restore}.items():
+            spent = seconds(partial(convert, restore), clock=time.process_time)
+            results[name] = {"frames_per_second": num_frames / spent}
         results["restore, each frame"]["jitter_px"] = jitter([predict(frame) for frame in frames()])
         still = [camera_flow(pooled.camera)[0]] * 2  # one flow for all frames
         results["restore, pool=lens"]["jitter_px"] = jitter(still)
@@ -312,7 +302,7 @@ def held_out(
             draw: dict[str, Any] = {"seed": seed, "keys": [frames.keys[members[0]]]}
             pairs = [effect.degrade(frames[i].image[None], **draw) for i in members]
             true = sparse(pairs[0].restore_flow)[0]
-            costs = costs_of_lenses([to_gray(pair.image[0]) for pair in pairs], prior)
+            costs = costs_of_lenses([gray_levels(pair.image[0]) for pair in pairs], prior)
             flows = {"nothing": 0 * true, "constant": mean, "lines": posterior_flow(costs, prior)}
             if network:
                 predicted = [sparse(resize_flow(network.predict(pair.image), size)) for pair in pairs]
@@ -329,11 +319,6 @@ def held_out(
         sep="  ",
     )
     return rows
-
-
-def to_gray(image: Tensor) -> np.ndarray:
-    """Convert a frame (3, H, W) in [0, 1] to gray bytes."""
-    return cv2.cvtColor(pixels_of(image), cv2.COLOR_RGB2GRAY)
 
 
 def rectify(frame: Tensor, flow: Tensor) -> Tensor:
@@ -357,7 +342,7 @@ def real(data: Path, sets: Sequence[str], network: Network | None) -> list[Row]:
         pattern, folder, entry, calibration = SETS[name]
         frames = [read_image(path)[None] for path in sorted(data.glob(pattern))]
         reference = json.loads((data / folder / "reference.json").read_text())[entry]
-        truth = calibrated_camera(reference, calibration)
+        truth = camera_from_entry(reference[calibration], reference["image_size"])
         camera = truth.resized(width=frames[0].shape[3], height=frames[0].shape[2])
         measured, estimate = measure(name, frames, camera, network=network)
         flow = camera_flow(camera)[0]

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from timing import RESULTS, count, size, write_json
+from timing import RESULTS, count, seconds, size, write_json
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.benchmark import Timer
 from torch.utils.data import DataLoader, Dataset
@@ -302,12 +302,7 @@ def _scene(args: argparse.Namespace) -> tuple[Mapping[str, Any], list[str]]:
 
 
 def _median_seconds(call: Callable[[], object]) -> float:
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return median(times)
+    return median(seconds(call) for _ in range(3))
 
 
 def _descendants(process: int) -> list[int]:

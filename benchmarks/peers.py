@@ -14,6 +14,7 @@ from functools import partial
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from timing import (
     COPY,
@@ -122,19 +123,10 @@ def ours(frame: Tensor, pixels: Any) -> dict[str, Candidate]:
     height, width = frame.shape[2:]
     lens = partial(tr.LensDistortion, k1_range=(K1, K1), k2_range=(K2, K2), p1_range=(P, P), p2_range=(P, P))
     lens = partial(lens, focal_range=(FOCAL, FOCAL))
-    camera = tr.Camera(
-        width=width,
-        height=height,
-        fx=FOCAL * width,
-        fy=FOCAL * width,
-        cx=(width - 1) / 2,
-        cy=(height - 1) / 2,
-        coefficients=(K1, K2, P, P),
-    )
     field: dict[str, Any] = {"amplitude_range": (FIELD_PX, FIELD_PX), "length_range": (LENGTH_PX, LENGTH_PX)}
     spline: dict[str, Any] = {"amplitude_range": (SPLINE_PX, SPLINE_PX)}
     within = f"within {TOLERANCE_PX} px"
-    effects = {"lens: torchrefract Rectification": tr.Rectification(camera)}
+    effects = {"lens: torchrefract Rectification": tr.Rectification(make_camera(height, width))}
     for words, tolerance_px in (("exact", None), (within, TOLERANCE_PX)):
         effects |= {
             f"lens: torchrefract LensDistortion, {words}": lens(tolerance_px=tolerance_px),
@@ -163,7 +155,8 @@ def kornia(frame: Tensor) -> dict[str, Candidate]:
     calibration = importlib.import_module("kornia.geometry.calibration")
     transform = importlib.import_module("kornia.geometry.transform")
     height, width = frame.shape[2:]
-    camera, lens = torch.tensor([_camera_matrix(height, width)]), torch.tensor([[K1, K2, P, P, 0.0]])
+    camera = make_camera(height, width)
+    matrix, lens = torch.tensor([camera.matrix]), torch.tensor([camera.coefficients])
     per_px = torch.tensor([2 / width, 2 / height])  # kornia's coordinates span 2
     strength = (FIELD_PX / _BLURRED * 2 / width, FIELD_PX / _BLURRED * 2 / height)
     side = torch.linspace(-1, 1, 4)
@@ -181,7 +174,7 @@ def kornia(frame: Tensor) -> dict[str, Candidate]:
         return transform.warp_image_tps(frame, points, kernel, affine)
 
     return {
-        "lens: kornia undistort_image": lambda: calibration.undistort_image(frame, camera, lens),
+        "lens: kornia undistort_image": lambda: calibration.undistort_image(frame, matrix, lens),
         "field: kornia elastic_transform2d": elastic,
         "spline: kornia warp_image_tps": sixteen_points,
         "spline: kornia RandomThinPlateSpline, 5 points": lambda: five_points(frame),
@@ -192,11 +185,11 @@ def kornia(frame: Tensor) -> dict[str, Candidate]:
 def opencv(package: Any, pixels: Any) -> dict[str, Candidate]:
     """Return the functions of OpenCV."""
     height, width = pixels.shape[:2]
-    camera = torch.tensor(_camera_matrix(height, width), dtype=torch.float64).numpy()
-    lens = torch.tensor([K1, K2, P, P, 0.0], dtype=torch.float64).numpy()
+    camera = make_camera(height, width)
+    matrix, lens = np.array(camera.matrix), np.array(camera.coefficients)
 
     def undistort() -> Any:
-        maps = package.initUndistortRectifyMap(camera, lens, None, camera, (width, height), package.CV_32FC1)
+        maps = package.initUndistortRectifyMap(matrix, lens, None, matrix, (width, height), package.CV_32FC1)
         return package.remap(pixels, *maps, package.INTER_LINEAR)
 
     return {"lens: OpenCV initUndistortRectifyMap + remap": undistort}
@@ -245,9 +238,10 @@ def _ranked(ratios: Mapping[str, float]) -> str:
     return ", ".join(f"{name.partition(': ')[2]} {ratios[name]:.3g} x" for name in ranked) or "none"
 
 
-def _camera_matrix(height: int, width: int) -> list[list[float]]:
-    focal = FOCAL * width
-    return [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
+def make_camera(height: int, width: int) -> tr.Camera:
+    """Return the camera of the task "lens"."""
+    pinhole: dict[str, Any] = {"fx": FOCAL * width, "fy": FOCAL * width, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    return tr.Camera(width=width, height=height, **pinhole, coefficients=(K1, K2, P, P, 0.0))
 
 
 if __name__ == "__main__":

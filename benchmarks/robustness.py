@@ -12,14 +12,15 @@ import argparse
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from severity import frames_in
-from timing import Bar, count, size
+from timing import Bar, count, seconds, size
 from torch import Tensor
 from torchvision import models
 
@@ -30,13 +31,14 @@ from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import evaluate
 from torchrefract.robustness.predictors import Predict, load_predictor
-from torchrefract.robustness.quantities import QUANTITIES
+from torchrefract.robustness.quantities import SCENES, quantity_of
 from torchrefract.robustness.scores import as_labels
 
 LIMIT = 1.2  # of the time of the evaluation over that of the model
 MODELS = ("opencv:hog", "torchvision:ssdlite320_mobilenet_v3_large", "torchvision:fasterrcnn_resnet50_fpn")
+DAY_SCENES = [name for name in SCENES if name != "night_fog"]
+cpu_seconds = partial(seconds, clock=time.process_time)
 _ONE_BOX = {"boxes": torch.tensor([[0.0, 0, 9, 9]]), "labels": torch.ones(1).long(), "scores": torch.ones(1)}
-SCENES = [name for name in QUANTITIES if name != "night_fog"]  # of frames by day
 
 
 def main() -> None:
@@ -56,7 +58,7 @@ def main() -> None:
     )
     print("CPU ms for a picture, by severity")
     for name, costs in scene_costs(frames).items():
-        print(f"{name:20}", *(f"{1e3 * seconds:6.1f}" for seconds in costs.values()))
+        print(f"{name:20}", *(f"{1e3 * cost:6.1f}" for cost in costs.values()))
     for model in args.models:
         bare, evaluation = model_cost(load(model), frames)
         print(f"\n{model}: {bare:.2f} s alone, {evaluation:.2f} s in the evaluation of a frame")
@@ -66,7 +68,7 @@ def main() -> None:
 @lru_cache
 def scenes(width: int) -> Mapping[str, Mapping[int, Effect]]:
     """Return the scenes of the command for frames of a width, by name and severity."""
-    return {name: {s: getattr(presets, name)(s, width=width) for s in presets.SEVERITIES} for name in SCENES}
+    return {name: {s: getattr(presets, name)(s, width=width) for s in presets.SEVERITIES} for name in DAY_SCENES}
 
 
 def scene_costs(frames: Sequence[Tensor]) -> dict[str, dict[int, float]]:
@@ -104,19 +106,14 @@ def model_cost(predict: Predict, frames: Sequence[Tensor]) -> tuple[float, float
         pictures.append(images)
         return predict(images)
 
-    by_name, options = scenes(frames[0].shape[-1]), {"as_target": as_labels, "quantities": QUANTITIES}
+    by_name = scenes(frames[0].shape[-1])
+    quantities = {name: of for name, by in by_name.items() if (of := quantity_of(by.values()))}
+    options: dict[str, Any] = {"as_target": as_labels, "quantities": quantities}
     samples = [(f"frame {i}", frame, None) for i, frame in enumerate(frames)]
     evaluate(lambda _: [_ONE_BOX], samples[:1], by_name, choose_score, **options)  # makes plans and compiles kernels
     evaluation = cpu_seconds(lambda: evaluate(recorded, samples, by_name, choose_score, **options))
     bare = cpu_seconds(lambda: [predict(picture) for picture in pictures])
     return bare / len(frames), evaluation / len(frames)
-
-
-def cpu_seconds(call: Callable[[], object]) -> float:
-    """Return the seconds of the CPU that a call takes."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrefract import presets
-from torchrefract.data.images import files_in, read_image
+from torchrefract.data.frames import evenly_spaced
+from torchrefract.data.images import files_in, pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose
@@ -103,8 +104,7 @@ def _places(x: np.ndarray, y: np.ndarray, flow: Tensor | None) -> tuple[np.ndarr
 
 def gray_levels(image: Tensor) -> np.ndarray:
     """Return the luma of an image (3, H, W) in [0, 1] as (H, W), uint8."""
-    pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(pixels_of(image), cv2.COLOR_RGB2GRAY)
 
 
 def scene_for_width(name: str, severity: int, width: int) -> Any:
@@ -140,7 +140,7 @@ def measure(effect: Effect, frames: list[Tensor], depths: Sequence[Tensor | None
 def frames_in(root: Path, count: int, without: list[str]) -> list[Tensor]:
     """Read evenly spaced pictures of a folder, (1, 3, H, W), of those whose name has none of some beginnings."""
     paths = [path for path in files_in(root) if not path.name.startswith(tuple(without))]
-    return [read_image(paths[i * len(paths) // count])[None] for i in range(min(count, len(paths)))]
+    return [read_image(paths[i])[None] for i in evenly_spaced(len(paths), count)]
 
 
 def rows(names: list[str], frames: list[Tensor], depths: Sequence[Tensor | None]) -> Iterator[str]:

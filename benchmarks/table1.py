@@ -24,12 +24,12 @@ from statistics import median
 from typing import NamedTuple, cast
 
 import torch
-from timing import RESULTS, commit, count, seconds, write_json
+from timing import RESULTS, commit, count, markdown, seconds, write_json
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from torchrefract._tensor import to_float, to_uint8
-from torchrefract.data.frames import FrameFolder
+from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.module import BORDERS, make_pair
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import OneOf
@@ -251,7 +251,7 @@ def score_task(task: str, models: dict[str, Loaded], args: argparse.Namespace) -
             yield from _lines(Line(task, "", "", method, _NO_SCORES, 0, size), by_effect, keys, groups)
         for loaded in (loaded for loaded in models.values() if loaded.size == size):
             if isinstance(loaded.model, Diffusion) and args.sampled < len(keys):
-                sampled = _evenly(len(keys), args.sampled)
+                sampled = evenly_spaced(len(keys), args.sampled)
                 nothing = {name: scores[sampled] for name, scores in references[_NOTHING].items()}
                 line = Line(task, "", "", f"{_NOTHING}, frames of DDPM", _NO_SCORES, 0, size)
                 yield from _lines(line, nothing, [keys[i] for i in sampled], groups)
@@ -300,11 +300,11 @@ def format_tables(lines: Sequence[Line]) -> str:
         head = ["method", "L", "L_rec", "L_k", "PSNR (dB)", "SSIM", f"EPE (px at {METRIC_SIZE[1]}x{METRIC_SIZE[0]})"]
         head += ["x do nothing", "frames", "parameters", f"ms per frame of {size}"]
         nothing = {line.frames: line.scores for line in of_table if line.method.startswith(_NOTHING)}
-        rows = [head, ["---"] * len(head), *(_cells(line, nothing[line.frames]) for line in of_table)]
+        rows = [_cells(line, nothing[line.frames]) for line in of_table]
         if effect == MIX and group == _ALL:
             rows += [_paper_cells(name, *values) for name, values in PAPER[task].items()]
         title = f"### {task}: {effect}" + ("" if group == _ALL else f", frames {group}")
-        parts.append("\n".join([title, "", *("| " + " | ".join(row) + " |" for row in rows)]))
+        parts.append(f"{title}\n\n{markdown(head, rows)}")
     return "\n\n".join(parts)
 
 
@@ -327,7 +327,7 @@ def _or_empty(value: float, form: str) -> str:
 
 def _load_frames(held_out: FrameFolder, limit: int, device: torch.device) -> list[Frame]:
     """Load batches of up to `limit` held-out frames, evenly chosen; 0 loads all."""
-    chosen = Subset(held_out, _evenly(len(held_out), limit))
+    chosen = Subset(held_out, evenly_spaced(len(held_out), limit or len(held_out)))
     return [Frame(*(value.to(device) for value in batch)) for batch in DataLoader(chosen, batch_size=_BATCH)]
 
 
@@ -348,14 +348,8 @@ def _subsample(pairs: list[Pair], limit: int) -> list[Pair]:
     if not limit:
         return pairs
     every = [torch.cat(values) for values in zip(*pairs, strict=True)]
-    chosen = torch.tensor(_evenly(len(every[0]), limit), device=every[0].device)
+    chosen = torch.tensor(evenly_spaced(len(every[0]), limit), device=every[0].device)
     return [Pair(*(value[rows] for value in every)) for rows in chosen.split(_BATCH)]
-
-
-def _evenly(count: int, limit: int) -> list[int]:
-    """Return `limit` of the numbers below `count`, evenly; all of them for 0."""
-    chosen = min(count, limit or count)
-    return [i * count // chosen for i in range(chosen)]
 
 
 @torch.inference_mode()

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import quantiles
 from typing import Any
@@ -34,6 +35,9 @@ GRID_SAMPLE = "bare grid_sample"
 COPY = "copy of the frame"
 RESULTS = Path(__file__).parent / "results"
 TOLERANCE_PX = 0.05
+ROUGH_TURBULENCE = partial(
+    tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0)
+)
 
 MIN_REPEATS = 15
 _SLOW_S = 0.5  # candidates that take longer run in the first rounds only
@@ -146,7 +150,7 @@ class Conditions:
             load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
             torch=torch.__version__,
             python=platform.python_version(),
-            packages={name: metadata.version(name) for name in ("numpy", "numba", "triton") if _is_installed(name)},
+            packages={name: metadata.version(name) for name in ("numpy", "numba", "triton") if find_spec(name)},
             threads=threads,
             repeats=repeats,
             frame=tuple(frame.shape),
@@ -291,6 +295,11 @@ def table(timings: Sequence[Timing], conditions: Conditions | None = None) -> st
     return "\n".join([*([] if conditions is None else [_describe(conditions), ""]), lines[0], rule, *lines[1:]])
 
 
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Format rows of cells as a table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
 def save(
     path: Path,
     timings: Sequence[Timing],
@@ -423,11 +432,3 @@ def _cpu() -> str | None:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or None)
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True

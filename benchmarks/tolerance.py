@@ -25,10 +25,10 @@ from timing import RESULTS, count, size, write_json
 from torch import Tensor
 
 import torchrefract as tr
+from torchrefract.cameras.brown_conrady import POLYNOMIAL12
 
 TOLERANCES = (1.0, 0.3, 0.1, 0.03, 0.01)  # px, or levels
 SMALLEST, LARGEST = (64, 64), (1080, 1920)
-_LENS_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 
 # Takes a random generator and the size of the frame; returns a function that makes the effect, whose argument is the
 # tolerance (None is exact).
@@ -130,10 +130,10 @@ def _light(kind: Callable[..., Any], arguments: dict[str, Any]) -> Callable[[flo
 
 
 def _lens(dice: random.Random, *_: int) -> Callable[[float | None], Any]:
-    ranges = {f"{name}_range": (0.0, 0.0) for name in _LENS_COEFFICIENTS}
+    ranges = {f"{name}_range": (0.0, 0.0) for name in POLYNOMIAL12}
     for i in range(dice.randint(1, 3)):
         ranges[f"k{i + 1}_range"] = _signed_range(dice, 1e-4, 0.5)
-    for name in _LENS_COEFFICIENTS[6:]:
+    for name in POLYNOMIAL12[6:]:
         if dice.random() < 0.3:
             ranges[f"{name}_range"] = _signed_range(dice, 1e-5, 0.03)
     for axis in "xy":

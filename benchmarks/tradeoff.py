@@ -28,12 +28,14 @@ from timing import (
     GRID_SAMPLE,
     PHOTOMETRIC,
     RESULTS,
+    ROUGH_TURBULENCE,
     TOLERANCE_PX,
     WARPS,
     Conditions,
     Spread,
     all_warps,
     count,
+    markdown,
     measure,
     parser,
     references,
@@ -41,7 +43,7 @@ from timing import (
 )
 from torch import Tensor
 
-import torchrefract as tr
+from torchrefract.data.frames import evenly_spaced
 from torchrefract.data.images import EXTENSIONS, fit, image_size, read_image
 from torchrefract.data.road_scenes import render_road_scenes
 
@@ -119,7 +121,7 @@ def main() -> None:
         print(f"{name} ...", flush=True)
         with torch.no_grad():
             rows += evaluate(name, variants, frames, repeats=args.repeats, threads=args.threads)
-    print("", *table(rows), "", sep="\n")
+    print("", table(rows), "", sep="\n")
     content = {"what": WHAT, "conditions": asdict(conditions), "frames": len(frames), "rows": list(map(asdict, rows))}
     write_json(args.out / "tradeoff.json", content)
     plot(args.out / "tradeoff.png", rows)
@@ -127,10 +129,9 @@ def main() -> None:
 
 def settings() -> dict[str, list[Variant]]:
     """Return the variants of each effect, by its name."""
-    rough = partial(tr.Turbulence, amplitude_range=(1.2, 1.8), length_range=(40.0, 80.0), aperture_range=(4.0, 6.0))
     variants = {name: _tolerances_px(make) + _interpolations(make) for name, make in WARPS.items()}
     variants["divergence-free"] += _steps(WARPS["divergence-free"])
-    variants |= {"rough turbulence": _tolerances_px(rough), "all four warps": _tolerances_px(all_warps)}
+    variants |= {"rough turbulence": _tolerances_px(ROUGH_TURBULENCE), "all four warps": _tolerances_px(all_warps)}
     variants |= {name: _tolerances(make) for name, make in PHOTOMETRIC.items()}
     fog = PHOTOMETRIC["uniform fog"]
     linear = partial(fog, linear_light=True)
@@ -181,7 +182,7 @@ def read_frames(folder: str, size: tuple[int, int], count: int) -> list[Tensor]:
             f"frames must be {SYNTHETIC!r} or a folder with a picture of at least {size[0]}x{size[1]} px (height x "
             f"width), got {folder} with {len(paths)} pictures"
         )
-    return [fit(read_image(path), size)[None] for path in large[:: max(1, len(large) // count)][:count]]
+    return [fit(read_image(large[i]), size)[None] for i in evenly_spaced(len(large), count)]
 
 
 def evaluate(
@@ -275,16 +276,16 @@ def pareto_front(costs: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def table(rows: Sequence[Row]) -> list[str]:
+def table(rows: Sequence[Row]) -> str:
     """Format the rows as Markdown."""
-    lines = ["| effect | setting | value | x bare grid_sample | px, largest | levels, mean (largest) |"]
-    lines.append("| --- | --- | --- | --- | --- | --- |")
+    head = ("effect", "setting", "value", "x bare grid_sample", "px, largest", "levels, mean (largest)")
+    lines = []
     for row in rows:
         ratio = Spread(row.ratio, row.ratio_lower, row.ratio_upper)
         px = "" if row.largest_px is None else f"{row.largest_px:.2g}"
         levels = f"{row.mean_levels:.2g} ({row.largest_levels:.2g})"
-        lines.append(f"| {row.effect} | {row.setting} | {row.value} | {ratio} | {px} | {levels} |")
-    return lines
+        lines.append((row.effect, row.setting, row.value, str(ratio), px, levels))
+    return markdown(head, lines)
 
 
 def plot(path: Path, rows: Sequence[Row]) -> None:

@@ -1,14 +1,16 @@
 """Paths on this machine and in object stores, atomic file writes, and the folder of the configuration files."""
 
+import csv
 import errno
 import hashlib
+import io
 import logging
 import os
 import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
@@ -201,3 +203,19 @@ def write_file(path: Path, content: str | bytes, *, alone: bool = False) -> None
             temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
         else:
             temporary.write_bytes(content)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Replace a file by a table with a column for each name in a row; see `replace_file`."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    with replace_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(names), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_figure(path: Path, figure: Any, *, dpi: float | None = None) -> None:
+    """Replace a file by a figure of matplotlib, whose errors of a full disk would not say so; see `replace_file`."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=path.suffix[1:], dpi=dpi or "figure")
+    write_file(path, stream.getvalue())

@@ -170,6 +170,12 @@ def interpolate_channels(nodes: Tensor, size: tuple[int, int]) -> Tensor:
     return images.view(*nodes.shape[:2], *size)
 
 
+def pad_to_multiple(maps: Tensor, multiple: int) -> Tensor:
+    """Repeat the last row and column of (B, C, H, W) until both sides are multiples of a number."""
+    height, width = maps.shape[2:]
+    return F.pad(maps, (0, -width % multiple, 0, -height % multiple), mode="replicate")
+
+
 def is_channels_last(image: Tensor) -> bool:
     """Return True if the image (B, C, H, W) has the channels_last memory format and is not contiguous as well."""
     return (

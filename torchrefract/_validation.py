@@ -127,12 +127,16 @@ def check_rgb(name: str, image: Tensor) -> Tensor:
 
 def check_flow(name: str, flow: Tensor) -> Tensor:
     """Return `flow` if it is a floating tensor (B, 2, H, W)."""
-    check_tensor(name, flow)
-    if flow.ndim != 4 or flow.shape[1] != 2:
-        raise ValueError(f"{name} must have shape (B, 2, H, W), got {tuple(flow.shape)}")
-    if not flow.is_floating_point():
-        raise TypeError(f"{name} must be of a floating type, got {flow.dtype}")
-    return flow
+    return check_map(name, flow, channels=2)
+
+
+def check_map(name: str, value: Tensor, *, channels: int) -> Tensor:
+    """Return `value` if it is a floating tensor (B, channels, H, W)."""
+    if check_tensor(name, value).ndim != 4 or value.shape[1] != channels:
+        raise ValueError(f"{name} must have shape (B, {channels}, H, W), got {tuple(value.shape)}")
+    if not value.is_floating_point():
+        raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
+    return value
 
 
 def check_values(name: str, condition: str, value: Tensor, test: Callable[[Tensor], Tensor]) -> None:

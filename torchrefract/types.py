@@ -109,6 +109,8 @@ class Pair(NamedTuple):
 class Degraded:
     """A degraded image with its maps, each of which is computed when it is first read.
 
+    The `valid` of some effects of light then looks at the clean image: read it before you write to that image.
+
     image: as the input, (B, C, H, W), (C, H, W) or (B, T, C, H, W). Maps have the same dimensions before C, which are
         (B, T) for clips.
     params: the drawn parameters, a NamedTuple of tensors with a leading batch dimension.

@@ -5,6 +5,7 @@ from statistics import fmean
 import lens_estimation
 import numpy as np
 import pytest
+import severity
 import torch
 from pictures import save_picture
 
@@ -75,7 +76,7 @@ def test_lines_of_one_frame_choose_among_the_lenses_of_an_effect():
     torch.testing.assert_close(flow, prior.flows.mean(dim=0))  # a frame without edges tells nothing
     clean = torch.from_numpy(poles(*size)).permute(2, 0, 1)[None] / 255
     degraded = effect.degrade(clean, seed=1, keys=[5])
-    costs = lens_estimation.costs_of_lenses([lens_estimation.to_gray(degraded.image[0])], prior)
+    costs = lens_estimation.costs_of_lenses([severity.gray_levels(degraded.image[0])], prior)
     flow = lens_estimation.posterior_flow(costs, prior)
     true = lens_estimation.sparse(degraded.restore_flow)[0]
     assert (flow - true).norm(dim=0).mean() < 0.25 * (prior.flows.mean(dim=0) - true).norm(dim=0).mean()

@@ -28,6 +28,6 @@ def test_the_command_prints_each_scene_and_the_ratio_of_each_model(monkeypatch, 
     robustness.scenes.cache_clear()
     lines = run_program(robustness, "--count", "1", "--size", "90x160", "--models", "opencv:hog").splitlines()
     robustness.scenes.cache_clear()
-    assert [line.split()[0] for line in lines[1:7]] == robustness.SCENES
+    assert [line.split()[0] for line in lines[1:7]] == robustness.DAY_SCENES
     assert lines[-1].startswith("opencv:hog: ")
     assert "bar <= 1.2 x the model alone" in lines[-1]

@@ -58,13 +58,6 @@ def test_scores_are_those_of_the_task_with_nan_for_a_missing_map():
     assert math.isnan(scores[5])
 
 
-@pytest.mark.quick
-def test_frames_are_chosen_evenly():
-    assert table1._evenly(10, 0) == list(range(10))
-    assert table1._evenly(10, 3) == [0, 3, 6]
-    assert table1._evenly(2, 5) == [0, 1]
-
-
 def write_frames(tmp_path: Path) -> Path:
     image, _ = render_road_scenes(torch.arange(4), *SIZE, seed=2)
     for i, picture in enumerate(image):

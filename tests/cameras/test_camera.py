@@ -127,6 +127,18 @@ def test_cropped_flipped_and_resized_cameras_match_the_changed_frame(
     assert_close(after.points, pixel(before.points), rtol=0, atol=1e-11)
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("model", LENSES)
+def test_a_camera_without_its_lens_shows_undistorted_points_with_its_pinhole(model):
+    original = camera(LENSES[model], model)
+    pinhole = original.without_lens(zoom=2.0)
+    assert pinhole.is_pinhole
+    (fx, _, cx), (_, fy, cy), _ = original.matrix
+    expected = RAYS[:, :2] / RAYS[:, 2:] * torch.tensor([2 * fx, 2 * fy]) + torch.tensor([cx, cy])
+    rays = original.unproject(original.project(RAYS).points).points
+    assert_close(pinhole.project(rays).points, expected, rtol=0, atol=1e-9)
+
+
 def test_coverage_is_the_area_of_the_circle_before_the_fold():
     # A barrel of one coefficient shows r_d up to 2 / (3 sqrt(-3 k1)).
     square = {"width": 201, "height": 201, "fx": 100.0, "fy": 100.0, "cx": 100.0, "cy": 100.0}

@@ -192,7 +192,11 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "Gyroflow, given a size": (gyroflow(), {"width": 320}, "width must be None for a file of Gyroflow, got 320"),
     "lensfun, odd powers": (ODD, FRAME, f"with a = 0 and c = 0, got .*Lens 3mm.*a = 0.01, c = 0.02, .*; {NO_LENS}"),
     "lensfun, another model": (lensfun('model="acm" focal="3"'), FRAME, "hold poly3, poly5, or .*, got .* with acm"),
-    "lensfun, another type": (lensfun(POLY3, kind="equisolid"), FRAME, "fisheye lens, got .* with the type equisolid"),
+    "lensfun, another type": (
+        lensfun(POLY3, kind="equisolid"),
+        FRAME,
+        "of rectilinear, fisheye, got .*'equisolid'",
+    ),
     "lensfun, no size": (lensfun(POLY3), {}, "width and height must be those of the frames, which .* does not hold"),
     "lensfun, 16:9": (lensfun(POLY3), FRAME | {"height": 450}, "aspect ratio 4:3 of .* unless crop_factor .*800 x 450"),
     "lensfun, field of view": (lensfun(POLY3, extra=FIELD_OF_VIEW), FRAME, "without field-of-view"),

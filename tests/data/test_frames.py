@@ -12,7 +12,7 @@ from PIL import Image
 from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
-from torchrefract.data.frames import FrameFolder, name_prefix
+from torchrefract.data.frames import FrameFolder, evenly_spaced, name_prefix
 from torchrefract.data.images import fit, read_image
 
 SIZE = (4, 6)
@@ -32,6 +32,13 @@ def numbered(drive: str, count: int) -> list[str]:
 
 def names(folder: FrameFolder) -> list[str]:
     return [path.relative_to(folder.root).as_posix() for path in folder.paths]
+
+
+@pytest.mark.quick
+def test_frames_are_chosen_evenly():
+    assert evenly_spaced(10, 10) == list(range(10))
+    assert evenly_spaced(10, 3) == [0, 3, 6]
+    assert evenly_spaced(2, 5) == [0, 1]
 
 
 @pytest.mark.quick

@@ -172,6 +172,16 @@ def test_a_normalized_depth_raises():
         HeterogeneousFog().degrade(picture(1, 3, 8, 9), depth=picture(1, 1, 8, 9))
 
 
+def test_fog_without_a_scale_height_is_even_up_to_the_sky_beside_dust():
+    image, depth = random_image(2, 3, 24, 32), torch.full((2, 1, 24, 32), torch.inf)
+    fog = HeterogeneousFog(mode="ray", scale_height_range=(2.0, 2.0))
+    dust = fog.sample(image, seed=7)
+    even = dust._replace(scale_height=torch.full((2,), torch.inf))
+    mixed = dust._replace(scale_height=torch.tensor([torch.inf, 2.0]))
+    expected = fog.apply(image, even, depth=depth).extinction[0], fog.apply(image, dust, depth=depth).extinction[1]
+    assert_close(fog.apply(image, mixed, depth=depth).extinction, torch.stack(expected))
+
+
 def test_a_scale_height_that_does_not_fit_raises():
     image = torch.zeros(1, 3, 8, 9)
     plume = HeterogeneousFog(mode="ray", scale_height_range=(1.0, 2.0)).sample(image, seed=7)

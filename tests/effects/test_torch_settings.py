@@ -64,6 +64,14 @@ def test_the_default_type_changes_no_bit(effect, default_type):
         assert_equal_maps(maps_of(effect.degrade(image, seed=7, frame=2)), expected)
 
 
+def test_the_default_type_changes_no_bit_of_lamps_in_fog(default_type):
+    fog = tr.HeterogeneousFog(mode="ray", airlight=0.1, lamp_luminance=20.0)
+    image = random_image(2, 3, *SIZE)
+    expected = maps_of(fog.degrade(image, seed=7))
+    default_type(torch.float64)
+    assert_equal_maps(maps_of(fog.degrade(image, seed=7)), expected)
+
+
 def test_the_default_type_changes_no_bit_of_moved_labels(default_type):
     flow = tr.LensDistortion().degrade(random_image(1, 3, *SIZE), seed=7).flow
     points, boxes = 30 * random_image(1, 9, 2), torch.tensor([[3.0, 4.0, 20.0, 25.0]])

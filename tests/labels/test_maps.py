@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from torchrefract import LensDistortion, warp_depth, warp_mask, warp_optical_flow, warp_points
 
@@ -73,6 +74,15 @@ def test_infinite_depth_is_valid_and_nan_is_not():
     warped, valid = warp_depth(depth, flow, fill=9.0)
     assert warped.flatten().tolist() == [torch.inf, 3.0, 9.0, 9.0]
     assert valid.flatten().tolist() == [True, True, False, False]
+
+
+def test_bilinear_depth_stays_where_nothing_moves_next_to_the_sky_and_unknown_depth():
+    depth = torch.full((1, 1, 48, 80), 20.0)
+    depth[:, :, :24], depth[:, :, 40:44, 10:20] = torch.inf, torch.nan
+    for kind in (torch.float32, torch.float64):
+        warped, valid = warp_depth(depth.to(kind), torch.zeros(1, 2, 48, 80), fill=-1.0, interpolation="bilinear")
+        assert torch.equal(valid, ~depth.isnan())
+        assert_close(warped, depth.to(kind).nan_to_num(nan=-1.0, posinf=torch.inf))
 
 
 FLOW, ONE_FLOW, MAP = torch.zeros(2, 2, 5, 6), torch.zeros(2, 5, 6), torch.zeros(1, 5, 6)

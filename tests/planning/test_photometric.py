@@ -213,6 +213,13 @@ def test_the_mean_of_noise_over_a_frame_has_the_variance_of_its_bound(period):
     assert 0.1 * noise_mean_variance(period, 60, 90) <= variance <= 1.2 * noise_mean_variance(period, 60, 90)
 
 
+def test_a_coarse_octave_is_kept_without_which_no_mean_has_a_bound():
+    options: dict[str, Any] = {"scales": (3,), "weights": (1,), "scale_unit": "cells"}
+    for visibility in (5.0, 30.0, 100.0):
+        fog = HeterogeneousFog(visibility_range=(visibility, visibility), tolerance=0.5, **options)
+        assert fog.plan(90, 160).octaves == (0,)
+
+
 def test_octaves_are_kept_if_the_mean_over_the_frame_may_vanish():
     request = PhotometricRequest(*SIZE, 1.0, False)
     model = FogErrorModel(5.0, (0.8,), False, True, periods=(300.0, 400.0), weights=(1 - 1e-9, 1e-9))

@@ -18,7 +18,7 @@ import torchrefract
 from torchrefract import Camera, key_of, presets
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
-from torchrefract.robustness.quantities import QUANTITIES
+from torchrefract.robustness.quantities import SCENES
 
 MODEL = """
 import torch
@@ -261,7 +261,7 @@ def test_the_camera_and_the_horizon_are_those_of_each_scene(call, results, tmp_p
     assert call(*words, "out=out", "camera=my camera=1.yaml", "horizon=0.4").code == 0
     assert call(*words, "out=without").code == 0
     given, without = ({s: of[0] for s, _, of in scores(tmp_path / out)["0.png"]} for out in ("out", "without"))
-    assert list(given) == [name for name in QUANTITIES if name != "night_fog"]  # of frames by day
+    assert list(given) == [name for name in SCENES if name != "night_fog"]  # of frames by day
     image = read_image(frames / "0.png")
     for scene, score in given.items():
         options = {"width": 64} if scene in ("highveld_heat_haze", "unpaved_road") else {}

@@ -136,7 +136,7 @@ def test_frames_are_read_one_by_one_and_degraded_at_their_time(frame):
 @pytest.mark.quick
 def test_fog_takes_the_depth_of_the_frames(frame):
     depth = torch.full((1, 1, *SIZE), 30.0)
-    animation = make_animation({"fog": FOG}, repeated(frame, 1), seed=1, depth=depth)
+    animation = make_animation({"fog": FOG}, repeated(frame, 1)._replace(depth=lambda t: depth), seed=1)
     (picture,) = animation.render([0])
     assert np.array_equal(cell(picture, animation, 0, 0), displayed(FOG.degrade(frame, seed=1, depth=depth).image))
 

@@ -203,6 +203,10 @@ class Camera:
                 raise ValueError(f"{name} must leave {size} of the frame's {limit} px, got {start}")
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
+    def without_lens(self, *, zoom: float = 1.0) -> "Camera":
+        """Return the pinhole of rectified frames of the same size, with both focal lengths times `zoom`."""
+        return replace(self, model="opencv", coefficients=(0.0,) * 4, fx=zoom * self.fx, fy=zoom * self.fy)
+
     def flipped(self, direction: str) -> "Camera":
         """Return the camera of the same frames mirrored left to right ("horizontal") or top to bottom ("vertical").
 

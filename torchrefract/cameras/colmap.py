@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrefract._io import write_file
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.documents import Document, abbreviate, fit_coefficients, list_names, read_text
+from torchrefract.cameras.documents import HALF_PIXEL, Document, abbreviate, fit_coefficients, list_names, read_text
 
 # COLMAP's models by their numbers: the model here, None if there is none; the numbers of focal lengths and of
 # coefficients, with cx and cy between them.
@@ -34,7 +34,6 @@ _MODELS: dict[str, tuple[str | None, int, int]] = {
     "EUCM": (None, 2, 2),
     "EQUIRECTANGULAR": (None, 0, 0),
 }
-_OFFSET = 0.5  # px: COLMAP has the center of the first pixel at (0.5, 0.5), this library at (0, 0)
 _FILES = ("cameras.bin", "cameras.txt")
 _LINE = re.compile(r"\d+ +[A-Z][A-Z_]+ +\d+ +\d+ ")
 
@@ -66,7 +65,7 @@ def write_colmap(path: str | Path, cameras: Mapping[int, Camera]) -> None:
         coefficients = fit_coefficients(camera, (0, 4, 8))
         model = {0: "PINHOLE", 4: "OPENCV", 8: "FULL_OPENCV"}[len(coefficients)]
         model = "OPENCV_FISHEYE" if camera.model == "fisheye" else model
-        pinhole = (camera.fx, camera.fy, camera.cx + _OFFSET, camera.cy + _OFFSET)
+        pinhole = (camera.fx, camera.fy, camera.cx + HALF_PIXEL, camera.cy + HALF_PIXEL)
         values = " ".join(map(repr, (*pinhole, *coefficients)))
         lines.append(f"{number} {model} {camera.width} {camera.height} {values}")
     write_file(Path(path), "\n".join(lines) + "\n")
@@ -82,8 +81,7 @@ def is_colmap(path: Path) -> bool:
         )
     if path.suffix.lower() != ".txt" or path.name == "cameras.txt":
         return path.name == "cameras.txt"
-    lines = (line.strip() for line in read_text(path).splitlines())
-    return any(_LINE.match(line) for line in lines if line and not line.startswith("#"))
+    return any(map(_LINE.match, _lines(path)))
 
 
 def colmap_rows(path: Path) -> dict[int, Callable[[], Camera]]:
@@ -97,15 +95,17 @@ def colmap_rows(path: Path) -> dict[int, Callable[[], Camera]]:
                 f"{list_names(map(str, files))}; state the file"
             )
         path = files[0]
-    if path.suffix.lower() == ".bin":
-        lines = list(_records(path))
-    else:
-        texts = (line.strip() for line in read_text(path).splitlines())
-        lines = [text.split() for text in texts if text and not text.startswith("#")]
+    lines = _records(path) if path.suffix.lower() == ".bin" else map(str.split, _lines(path))
     rows = [_row(path, words) for words in lines]
     if repeated := [number for number, count in Counter(number for number, _ in rows).items() if count > 1]:
         raise ValueError(f"path must hold each camera once, got {path} with {repeated[0]} twice")
     return dict(rows)
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text but for empty ones and comments."""
+    lines = (line.strip() for line in read_text(path).splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
 
 
 def _records(path: Path) -> Iterator[list[Any]]:
@@ -148,5 +148,5 @@ def _camera(document: Document, name: str, size: Sequence[int]) -> Camera:
         )
     values = document.numbers(f"parameters of {name}", count=num_focal + 2 + num_coefficients)
     (*focal, cx, cy), lens = values[: num_focal + 2], values[num_focal + 2 :]
-    pinhole = focal[0], focal[-1], cx - _OFFSET, cy - _OFFSET
+    pinhole = focal[0], focal[-1], cx - HALF_PIXEL, cy - HALF_PIXEL
     return document.camera(size, pinhole, lens if model == "division" else (*lens, *(0.0,) * (4 - len(lens))), model)

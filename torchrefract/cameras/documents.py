@@ -13,6 +13,8 @@ from xml.etree import ElementTree
 from torchrefract._validation import warn
 from torchrefract.cameras.camera import Camera
 
+HALF_PIXEL = 0.5  # px, where COLMAP and Metashape have the center of the first pixel; this library has it at 0
+CALIBRATE = "; calibrate the camera for one of these models, such as with python -m torchrefract.calibrate"
 _MAX_MESSAGE = 400  # characters of a parser's error to repeat
 _FARTHEST_CENTER = 0.15  # widths or heights, of a principal point from the middle; of published lenses at most 0.13
 _MAX_NAMES = 20  # names of a file to list in an error
@@ -73,15 +75,20 @@ class Document:
         if count is not None and len(result) != count:
             raise ValueError(f"path must hold {count} numbers as {name}, got {self.path} with {len(result)}")
         if is_matrix and isinstance(matrix := self.values[name], dict) and {"rows", "cols"} <= matrix.keys():
-            sides = Document(f"{self.path}, {name},", matrix)
-            (rows,), (columns,) = sides.integers("rows"), sides.integers("cols")
+            rows, columns = map(self.child(name).integer, ("rows", "cols"))
             if len(result) != rows * columns:
                 raise ValueError(
                     f"path must hold {rows} x {columns} numbers as {name}, got {self.path} with {len(result)}"
                 )
         return result
 
-    def integers(self, name: str, *, count: int = 1) -> list[int]:
+    def number(self, name: str) -> float:
+        return self.numbers(name, count=1)[0]
+
+    def integer(self, name: str) -> int:
+        return self.integers(name, count=1)[0]
+
+    def integers(self, name: str, *, count: int) -> list[int]:
         values = self.numbers(name, count=count)
         if wrong := [value for value in values if not value.is_integer()]:
             raise ValueError(f"path must hold a whole number as {name}, got {self.path} with {wrong[0]}")
@@ -97,7 +104,7 @@ class Document:
                 raise ValueError(
                     f"path must hold {key}, got {self.path} with {names}; add it, or state {side} in read_camera"
                 )
-            stated = self.integers(key)[0] if key in self.values else given
+            stated = self.integer(key) if key in self.values else given
             if given not in (None, stated):
                 raise ValueError(
                     f"{side} must be {stated} as {self.path} states, got {given}; use camera.resized for other frames"

@@ -20,6 +20,7 @@ from torchrefract._validation import check_choice, warn
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.colmap import colmap_rows, is_colmap, read_colmap, write_colmap
 from torchrefract.cameras.documents import (
+    CALIBRATE,
     Document,
     abbreviate,
     dump_yaml,
@@ -123,7 +124,7 @@ def read_opencv(path: str | Path) -> Camera:
     Raises:
         ValueError: a file of another form, or a camera that no model here computes exactly.
     """
-    return _plain_camera(Path(path), _storage(Path(path)))
+    return _plain_camera(_storage(Path(path)))
 
 
 def read_covariance(path: str | Path) -> np.ndarray | None:
@@ -200,9 +201,9 @@ def read_ros(path: str | Path) -> Camera:
     Raises:
         ValueError: a file of another form, or a camera that no model here computes exactly.
     """
-    documents = parse_documents(Path(path), read_text(Path(path)))
+    documents = _storage(Path(path))
     documents[0].get("distortion_model")
-    return _plain_camera(Path(path), documents)
+    return _plain_camera(documents)
 
 
 def write_ros(path: str | Path, camera: Camera, *, name: str = "camera") -> None:
@@ -237,8 +238,7 @@ def read_kalibr(path: str | Path) -> dict[str, Camera]:
     Pinholes with radtan (k1, k2, p1, p2) or none become "opencv", with equidistant "fisheye". A camera with another
     camera_model (omni, eucm, ds) or distortion_model (fov) raises ValueError.
     """
-    rows = _kalibr_rows(path, parse_documents(Path(path), read_text(Path(path))))
-    return {name: camera() for name, camera in rows.items()}
+    return {name: camera() for name, camera in _kalibr_rows(_storage(Path(path))).items()}
 
 
 def write_kalibr(path: str | Path, cameras: Mapping[str, Camera]) -> None:
@@ -285,7 +285,7 @@ def _recognize(path: Path) -> _Form:
         documents = parse_documents(path, text)
     except ValueError as error:
         raise _unknown_form(path, f"other text ({error})") from error
-    return _recognize_values(path, documents)
+    return _recognize_values(documents)
 
 
 def _recognize_xml(path: Path, root: ElementTree.Element) -> _Form:
@@ -295,37 +295,38 @@ def _recognize_xml(path: Path, root: ElementTree.Element) -> _Form:
         return _Form("Metashape", (), {"": partial(metashape_camera, path, root)})
     if root.tag != "opencv_storage":
         raise _unknown_form(path, f"<{root.tag}>")
-    return _recognize_values(path, [xml_document(path, root)])
+    return _recognize_values([xml_document(path, root)])
 
 
-def _recognize_values(path: Path, documents: Sequence[Document]) -> _Form:
-    values = documents[0].values
+def _recognize_values(documents: Sequence[Document]) -> _Form:
+    first, values = documents[0], documents[0].values
     if "fisheye_params" in values or "calib_dimension" in values:
-        return _Form("Gyroflow", (), {"": partial(gyroflow_camera, documents[0])})
+        return _Form("Gyroflow", (), {"": partial(gyroflow_camera, first)})
     if any(isinstance(value, dict) and "camera_model" in value for value in values.values()):
-        return _Form("Kalibr", ("name",), _kalibr_rows(path, documents))
-    if rows := orb_slam_rows(documents[0]):
+        return _Form("Kalibr", ("name",), _kalibr_rows(documents))
+    if rows := orb_slam_rows(first):
         return _Form("ORB-SLAM", ("name", "width", "height"), rows)
     if "model_type" in values and "projection_parameters" in values:
-        return _Form("VINS", (), {"": partial(vins_camera, documents[0])})
-    if documents[0].find(*_MATRIX) not in values:
-        raise _unknown_form(path, list_names(values))
-    return _Form("OpenCV or ROS", ("width", "height", "model"), {"": partial(_plain_camera, path, documents)})
+        return _Form("VINS", (), {"": partial(vins_camera, first)})
+    if first.find(*_MATRIX) not in values:
+        raise _unknown_form(first.path, list_names(values))
+    return _Form("OpenCV or ROS", ("width", "height", "model"), {"": partial(_plain_camera, documents)})
 
 
-def _unknown_form(path: Path, content: str) -> ValueError:
+def _unknown_form(path: Path | str, content: str) -> ValueError:
     return ValueError(
         "path must hold a camera of OpenCV, ROS, Kalibr, COLMAP, ORB-SLAM, VINS, Gyroflow, lensfun or Metashape, got "
         f"{path} with {content}; create torchrefract.Camera(...) of its numbers"
     )
 
 
-def _plain_camera(path: Path, documents: Sequence[Document], **given: Any) -> Camera:
+def _plain_camera(documents: Sequence[Document], **given: Any) -> Camera:
     """Return the camera that all documents of a file describe by the names of OpenCV and ROS."""
     cameras = Counter(_document_camera(document, **given) for document in documents)
     if len(cameras) > 1:
         raise ValueError(
-            f"path must hold one camera, got {path} with messages of {len(cameras)} different ones; keep those of one"
+            f"path must hold one camera, got {documents[0].path} with messages of {len(cameras)} different ones; keep "
+            "those of one"
         )
     return next(iter(cameras))
 
@@ -342,7 +343,7 @@ def _document_camera(
             f"path must describe whole frames, got {path} with the roi {abbreviate(region)}; remove roi, and use "
             "camera.cropped"
         )
-    binning = [document.integers(key)[0] for key in ("binning_x", "binning_y") if values.get(key) is not None]
+    binning = [document.integer(key) for key in ("binning_x", "binning_y") if values.get(key) is not None]
     if any(number not in (0, 1) for number in binning):
         raise ValueError(
             f"path must describe whole frames, got {path} with binning_x and binning_y of {binning}; remove them, and "
@@ -366,20 +367,19 @@ def _document_camera(
 def _stated_model(document: Document) -> str | None:
     # A topic of ROS has an empty text for a camera that is not calibrated, or whose frames are rectified.
     if document.values.get("distortion_model") not in (None, ""):
-        remedy = "; calibrate the camera for one of these models, such as with python -m torchrefract.calibrate"
-        return document.choice("distortion_model", _ROS_MODELS, remedy=remedy)
-    if "division_model" in document.values and document.integers("division_model") != [0]:
+        return document.choice("distortion_model", _ROS_MODELS, remedy=CALIBRATE)
+    if "division_model" in document.values and document.integer("division_model") != 0:
         return "division"
     if "fisheye_model" in document.values:
-        return "fisheye" if document.integers("fisheye_model") != [0] else "opencv"
+        return "fisheye" if document.integer("fisheye_model") != 0 else "opencv"
     return None
 
 
-def _kalibr_rows(path: str | Path, documents: Sequence[Document]) -> dict[str, Callable[[], Camera]]:
+def _kalibr_rows(documents: Sequence[Document]) -> dict[str, Callable[[], Camera]]:
+    first = documents[0]
     if len(documents) > 1:
-        raise ValueError(f"path must hold one chain of cameras, got {path} with {len(documents)} documents")
-    chains = documents[0].values
-    return {str(name): partial(_kalibr_camera, Document(f"{path}, {name},", values)) for name, values in chains.items()}
+        raise ValueError(f"path must hold one chain of cameras, got {first.path} with {len(documents)} documents")
+    return {str(name): partial(_kalibr_camera, first.child(name)) for name in first.values}
 
 
 def _kalibr_camera(document: Document) -> Camera:

@@ -14,9 +14,8 @@ from xml.etree import ElementTree
 
 from torchrefract._validation import check_count, check_positive
 from torchrefract.cameras.camera import Camera
-from torchrefract.cameras.documents import Document, abbreviate, list_names, xml_document
+from torchrefract.cameras.documents import CALIBRATE, HALF_PIXEL, Document, abbreviate, list_names, xml_document
 
-_HALF_PIXEL = 0.5  # px: Metashape has the center of the first pixel at (0.5, 0.5), this library at (0, 0)
 _ORB_SLAM_MODELS = {"PinHole": "opencv", "Pinhole": "opencv", "Rectified": "opencv", "KannalaBrandt8": "fisheye"}
 # The model here, and the names of focal lengths, center and coefficients.
 _VINS_MODELS = {
@@ -50,18 +49,17 @@ def _orb_slam_camera(document: Document, prefix: str, *, width: int | None = Non
         )
     if model == "opencv":
         values |= {f"{prefix}.{term}": 0.0 for term in terms if f"{prefix}.{term}" not in values}
-    numbers = [document.numbers(f"{prefix}.{name}", count=1)[0] for name in ("fx", "fy", "cx", "cy", *terms)]
+    numbers = [document.number(f"{prefix}.{name}") for name in ("fx", "fy", "cx", "cy", *terms)]
     return document.camera(document.size(width, height, prefix="Camera."), numbers[:4], numbers[4:], model)
 
 
 def vins_camera(document: Document) -> Camera:
     """Return the camera of a file of VINS, of the library camodocal; its k2 ... k5 are the k1 ... k4 of "fisheye"."""
-    remedy = "; calibrate the camera for one of these models, such as with python -m torchrefract.calibrate"
-    model, center, terms = document.choice("model_type", _VINS_MODELS, remedy=remedy)
+    model, center, terms = document.choice("model_type", _VINS_MODELS, remedy=CALIBRATE)
     parts = ("distortion_parameters", "projection_parameters")
     merged = {k: v for part in parts if part in document.values for k, v in document.child(part).values.items()}
     parameters = Document(document.path, merged)
-    numbers = [parameters.numbers(name, count=1)[0] for name in (*center, *terms)]
+    numbers = [parameters.number(name) for name in (*center, *terms)]
     return document.camera(document.size(None, None), numbers[:4], numbers[4:], model)
 
 
@@ -94,7 +92,7 @@ def gyroflow_camera(document: Document) -> Camera:
     # Gyroflow computes a fisheye whose coefficients are all zero as a pinhole.
     if not any(coefficients):
         model, coefficients = "opencv", [0.0] * 4
-    width, height = *size.integers("w"), *size.integers("h")
+    width, height = size.integer("w"), size.integer("h")
     fx, fy, *center = lens.pinhole("camera_matrix")
     if not values.get("asymmetrical"):
         center = (width - 1) / 2, (height - 1) / 2
@@ -118,8 +116,8 @@ def metashape_camera(path: Path, root: ElementTree.Element) -> Camera:
         )
     model = document.choice("projection", _METASHAPE_TYPES, remedy=_NO_EXACT_LENS)
     names = ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-    (f,) = document.numbers("f", count=1)
-    number = {name: document.numbers(name, count=1)[0] if name in document.values else 0.0 for name in names}
+    f = document.number("f")
+    number = {name: document.number(name) if name in document.values else 0.0 for name in names}
     unsupported = ("b2", "p3", "p4", *(("p1", "p2") if model == "fisheye" else ()))
     if wrong := [name for name in unsupported if number[name]]:
         raise ValueError(
@@ -132,8 +130,8 @@ def metashape_camera(path: Path, root: ElementTree.Element) -> Camera:
         coefficients = (k1, k2, k3, k4)
     elif k4:
         model, coefficients = "polynomial12", (k1, k2, k3, k4, 0.0, 0.0, p1, p2, 0.0, 0.0, 0.0, 0.0)
-    width, height = *document.integers("width"), *document.integers("height")
-    center = (side / 2 + number[name] - _HALF_PIXEL for side, name in ((width, "cx"), (height, "cy")))
+    width, height = document.integer("width"), document.integer("height")
+    center = (side / 2 + number[name] - HALF_PIXEL for side, name in ((width, "cx"), (height, "cy")))
     return document.camera((width, height), (f + number["b1"], f, *center), coefficients, model)
 
 
@@ -179,11 +177,8 @@ def _lensfun_camera(
         raise ValueError(f"width and height must be those of the frames, which {path} does not hold, got None")
     check_count("width", width)
     check_count("height", height)
-    kind = lens.findtext("type") or "rectilinear"
-    if kind not in _LENSFUN_TYPES:
-        raise ValueError(
-            f"path must hold a rectilinear or fisheye lens, got {path} with the type {kind}{_NO_EXACT_LENS}"
-        )
+    kind = Document(path, {"type": lens.findtext("type") or "rectilinear"})
+    model = kind.choice("type", _LENSFUN_TYPES, remedy=_NO_EXACT_LENS)
     for element in ("center", "fov", "field-of-view"):
         if lens.find(f".//{element}") is not None:
             raise ValueError(f"path must hold a lens without {element}, got {path} with it{_NO_EXACT_LENS}")
@@ -202,22 +197,16 @@ def _lensfun_camera(
     center_factor, k1, k2 = _lensfun_terms(path, distortion)
     if not center_factor > 0:
         raise ValueError(f"path must hold a distortion that grows at the center, got {path} with {center_factor:g}")
-    real = distortion.get("real-focal") or next(
-        (
-            element.get("real-focal")
-            for element in calibration.findall("real-focal-length")
-            if math.isclose(_positive(path, "focal", element.get("focal")), focal)
-        ),
-        None,
-    )
-    real_mm = _positive(path, "real-focal", real) if real is not None else focal * center_factor
+    measured = [distortion, *calibration.findall("real-focal-length")]
+    real = [m.get("real-focal") for m in measured if math.isclose(_positive(path, "focal", m.get("focal")), focal)]
+    real_mm = next((_positive(path, "real-focal", text) for text in real if text), focal * center_factor)
     half_height_mm = _FILM_DIAGONAL_MM / calibrated_crop / math.hypot(aspect, 1) / 2
     scale = real_mm / half_height_mm / center_factor  # of r_u, from focal lengths
     square = scale * scale
     coefficients = (k1 * square / center_factor, k2 * square * square / center_factor, 0.0, 0.0)
     pixel_mm = _FILM_DIAGONAL_MM / crop_factor / math.hypot(width, height)
     pinhole = (real_mm / pixel_mm, real_mm / pixel_mm, (width - 1) / 2, (height - 1) / 2)
-    return Document(path, {}).camera((width, height), pinhole, coefficients, _LENSFUN_TYPES[kind])
+    return Document(path, {}).camera((width, height), pinhole, coefficients, model)
 
 
 def _choose_distortion(
@@ -243,8 +232,8 @@ def _choose_distortion(
 
 def _lensfun_terms(path: Path, distortion: ElementTree.Element) -> tuple[float, float, float]:
     """Return c, k1, k2 of r_d = r_u (c + k1 r_u^2 + k2 r_u^4)."""
-    model = distortion.get("model")
-    k1, k2, a, b, c = (_number(path, term, distortion.get(term, "0")) for term in ("k1", "k2", "a", "b", "c"))
+    model, zeros = distortion.get("model"), dict.fromkeys(("k1", "k2", "a", "b", "c"), 0.0)
+    k1, k2, a, b, c = map(Document(path, zeros | distortion.attrib).number, zeros)
     if model == "poly3":
         return 1 - k1, k1, 0.0
     if model == "poly5":
@@ -258,13 +247,8 @@ def _lensfun_terms(path: Path, distortion: ElementTree.Element) -> tuple[float, 
     return 1 - b, b, 0.0
 
 
-def _number(path: Path, name: str, text: str | None) -> float:
-    (value,) = Document(path, {name: text}).numbers(name, count=1)
-    return value
-
-
 def _positive(path: Path, name: str, text: str | None) -> float:
-    value = _number(path, name, text)
+    value = Document(path, {name: text}).number(name)
     if not 0 < value < math.inf:
         raise ValueError(f"path must hold a number above 0 as {name}, got {path} with {value:g}")
     return value

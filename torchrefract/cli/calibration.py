@@ -1,6 +1,5 @@
 """The commands `calibrate`, `rectify` and `make_board`."""
 
-import io
 import json
 import sys
 from collections import Counter
@@ -14,7 +13,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file, write_file
+from torchrefract._io import replace_file, write_figure, write_file
 from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
@@ -80,10 +79,8 @@ def make_board(cfg: DictConfig) -> None:
     margin = read_option(cfg, "margin_mm", check_number, low=0.0, high=1000.0)
     if out.suffix.lower() not in _BOARD_FORMATS:
         raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
-    page = io.BytesIO()  # matplotlib's errors of a full disk would not say so
-    board_page(board, margin_mm=margin).savefig(page, format=out.suffix[1:], dpi=dpi)
     try:
-        write_file(out, page.getvalue())
+        write_figure(out, board_page(board, margin_mm=margin), dpi=dpi)
     except OSError as error:
         raise UsageError(f"{out} could not be written: {error.strerror}") from error
     width, height = board.size_mm

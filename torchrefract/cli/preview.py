@@ -1,7 +1,6 @@
 """Contact sheets and animations of effects on a picture, a video, a folder of frames or a rendered scene."""
 
-import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file
+from torchrefract._io import replace_file, write_figure
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
@@ -22,7 +21,6 @@ from torchrefract.data.media import VIDEOS, describe_turned, read_video
 from torchrefract.data.road_scenes import render_road_scenes
 from torchrefract.effects.base import Effect
 from torchrefract.visualization.animation import (
-    DepthSource,
     FrameSequence,
     animation_formats,
     make_animation,
@@ -40,7 +38,6 @@ class _Source(NamedTuple):
     """Frames to degrade."""
 
     frames: FrameSequence
-    depth: DepthSource
     name: str
     note: str  # on the depth
 
@@ -53,12 +50,12 @@ def preview(cfg: DictConfig) -> None:
     fps = read_option(cfg, "fps", check_number, low=0.1, high=_MAX_FPS)
     source = _source(cfg)
     num_frames = source.frames.num_frames
-    if source.depth is None:
+    if source.frames.depth is None:
         for effect in effects.values():
             warn_of_assumed_depth(effect)
     with _writing(str(cfg.out)) as path:
         if is_animation := path.suffix.lower() in animation_formats():
-            animation = make_animation(effects, source.frames, seed=seed, depth=source.depth)
+            animation = make_animation(effects, source.frames, seed=seed)
             times = progress(range(num_frames), str(cfg.out), count=num_frames)
             save_animation(animation, path, fps=fps, times=times)
         else:
@@ -69,17 +66,14 @@ def preview(cfg: DictConfig) -> None:
 
 def _save_contact_sheet(effects: dict[str, Effect], source: _Source, seed: int, path: Path) -> None:
     _, frame = next(source.frames.read([0]))
-    depth = source.depth(0) if callable(source.depth) else source.depth
+    depth = source.frames.depth and source.frames.depth(0)
     rows = []
     items = progress(effects.items(), "drawing the effects; a first run compiles for a minute", count=len(effects))
     for name, effect in items:
         with naming(name):
             rows.append(contact_sheet_row(name, effect, frame=frame, depth=depth, seed=seed))
     height, width = frame.shape[2:]
-    sheet = io.BytesIO()  # matplotlib's errors of a full disk would not say so
-    figure = contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}")
-    figure.savefig(sheet, format=path.suffix[1:])
-    path.write_bytes(sheet.getvalue())
+    write_figure(path, contact_sheet(rows, title=f"{source.name}, {width} x {height} px, seed {seed}"))
 
 
 def _effects(cfg: DictConfig) -> dict[str, Effect]:
@@ -100,7 +94,8 @@ def _source(cfg: DictConfig) -> _Source:
             )
         with naming("size"):
             image, depth = render_road_scenes(torch.tensor([cfg.seed]), *(size or _RENDERED_SIZE))
-        return _Source(_repeat(image, max_frames), depth, "a rendered road scene, as no picture was given", "")
+        frames = _repeat(image, max_frames)._replace(depth=lambda _: depth)
+        return _Source(frames, "a rendered road scene, as no picture was given", "")
     path = Path(str(cfg.image))
     (frames, maps), name = _read_frames(path, max_frames), _printable(path.name or path.resolve().name)
     if cfg.scene is not None and cfg.scene.get("camera") is not None:
@@ -108,8 +103,8 @@ def _source(cfg: DictConfig) -> _Source:
         if turned := describe_turned(files, upright=True):
             print_warning(turned)
     depth, note = (None, "") if cfg.depth is None else _depth(cfg, frames, maps, size)
-    resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)))
-    return _Source(resized, depth, name, note)
+    resized = FrameSequence(frames.num_frames, lambda times: ((t, _fit(x, size)) for t, x in frames.read(times)), depth)
+    return _Source(resized, name, note)
 
 
 def _read_frames(path: Path, max_frames: int) -> tuple[FrameSequence, Sequence[_MapName]]:
@@ -153,7 +148,7 @@ def _fit(frame: Tensor, size: tuple[int, int] | None) -> Tensor:
 
 def _depth(
     cfg: DictConfig, frames: FrameSequence, maps: Sequence[_MapName], size: tuple[int, int] | None
-) -> tuple[DepthSource, str]:
+) -> tuple[Callable[[int], Tensor], str]:
     """Return the depth of frames that are cropped and reduced to a size, from a map or a folder of maps, and a note."""
     scale = read_option(cfg, "depth_scale", check_positive)
     path, is_animation = Path(str(cfg.depth)), Path(str(cfg.out)).suffix.lower() in animation_formats()
@@ -172,7 +167,8 @@ def _depth(
     depth, missing = read_depth(path, scale=scale)
     with naming("depth"):
         depth = crop_depth(depth, (height, width), size, name=str(path))
-    return depth[None], f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
+    note = f"; {missing:.1%} of its depth is 0, taken as infinite" if missing else ""
+    return lambda _: depth[None], note
 
 
 def _printable(name: str) -> str:

@@ -219,7 +219,7 @@ def _print_failures(result: Robustness) -> None:
 
 
 def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
-    for scene in dict.fromkeys(level.scene for level in result.scores):
+    for scene in result.scenes:
         if scene in result.quantities:
             print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
         else:
@@ -320,7 +320,7 @@ def _worst(result: Robustness, count: int) -> list[tuple[str, Level]]:
     drops = {scene: result.clean - (result.worst_case or result.scores)[level] for scene, level in highest.items()}
     return [
         (result.names[i], highest[scene])
-        for scene in dict.fromkeys(level.scene for level in result.scores)
+        for scene in result.scenes
         for i in drops[scene].argsort(kind="stable")[::-1][:count]
         if drops[scene][i] > 0
     ]

@@ -23,7 +23,7 @@ from torchrefract.cli.options import naming
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
 from torchrefract.robustness.predictors import import_function
-from torchrefract.robustness.quantities import QUANTITIES
+from torchrefract.robustness.quantities import SCENES
 
 SCORES = "scores.jsonl"  # one line of settings, then one for each picture
 FORMAT = 3  # of these lines; 1 had no summaries of predictions, 2 scored pixels that show nothing
@@ -152,7 +152,7 @@ def levels_of(scenes: Any, severities: Any) -> list[Level]:
     """Return the levels of options; raise UsageError without a scene or for an unknown severity."""
     names = [scenes] if isinstance(scenes, str) else scenes or []
     if not names:
-        raise UsageError(f"scene must be some of {', '.join(QUANTITIES)}, or scenes of yours, got none")
+        raise UsageError(f"scene must be some of {', '.join(SCENES)}, or scenes of yours, got none")
     severities = [severities] if isinstance(severities, int | float) else severities
     if not severities or any(isinstance(s, bool) or s not in presets.SEVERITIES for s in severities):
         raise UsageError(f"severity must be some of {presets.SEVERITIES}, got {severities}")
@@ -230,7 +230,7 @@ def _read_scene(name: str) -> dict[Any, Any]:
         file = _shipped(name)
     if not file.is_file():
         raise UsageError(
-            f"scene must be some of {', '.join(QUANTITIES)}, a file .yaml, or package.module:function, got {name}"
+            f"scene must be some of {', '.join(SCENES)}, a file .yaml, or package.module:function, got {name}"
         )
     config: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
     if not isinstance(config, dict):

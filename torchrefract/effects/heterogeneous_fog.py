@@ -58,7 +58,7 @@ _ROAD_SCALES = (12.0, 24.0, 48.0, 96.0)
 _ROAD_WEIGHTS = (0.2, 0.3, 0.3, 0.2)
 _CONTRASTS = (0.0, 2.0)
 _SCALE_HEIGHTS = (0.05, 1e6)  # m
-_EVEN = 1e12  # m, a scale height at which the density is even
+_EVEN = 1e30  # m, a scale height at which the density is even up to the sky
 _FARTHEST_PX = 1e5  # of a box
 _DARK_AIRLIGHT = 0.4  # luma, below which fog is that of the night
 
@@ -374,7 +374,8 @@ class HeterogeneousFog(PhotometricEffect):
     def _unclip_lamps(self, image: Tensor, params: HeterogeneousFogParams) -> Tensor:
         """Return images in which lamps are brighter than white, in fog that is dark."""
         is_dark = luma(finite_or(params.airlight, 0.0).to(image.dtype)[:, :, None, None]) < _DARK_AIRLIGHT
-        return unclip_lamps(image, torch.where(expand_batch(is_dark, len(image)), self.lamp_luminance, 1.0))
+        luminance = image.new_full((), self.lamp_luminance)  # torch.where of two numbers is of the default type
+        return unclip_lamps(image, torch.where(expand_batch(is_dark, len(image)), luminance, 1.0))
 
     def _extinction(
         self, k: Tensor, params: HeterogeneousFogParams, distance: Tensor, image: Tensor, plan: PhotometricPlan

@@ -1,6 +1,5 @@
 """A frame of a calibrated camera as a pinhole would have shown it."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -175,8 +174,8 @@ class Rectification(WarpEffect):
 
     def clean_camera(self, height: int, width: int) -> Camera:
         """Return the pinhole of the rectified frames of a size."""
-        camera, zoom = self.camera.resized(width=width, height=height), self._constant_zoom(id(self), height, width)
-        return replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
+        camera = self.camera.resized(width=width, height=height)
+        return camera.without_lens(zoom=self._constant_zoom(id(self), height, width))
 
     def _zoom(self, params: RectificationParams, height: int, width: int) -> Tensor:
         return torch.full_like(params.focal[:, 0], self._constant_zoom(id(self), height, width))

@@ -1,6 +1,6 @@
 """The flow that shows frames of a camera of any model as a pinhole would have taken them, and the flow back."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -93,11 +93,10 @@ def camera_flow(camera: Camera, *, zoom: float = 1.0) -> tuple[Tensor, Tensor, C
     """
     camera.check_pole()
     zoom = check_positive("zoom", zoom)
-    pinhole = replace(camera, model="opencv", coefficients=(0.0,) * 4, fx=zoom * camera.fx, fy=zoom * camera.fy)
     numbers = camera.tensors(torch.empty(0, dtype=torch.float64, device="cpu"))
     points = pixel_lattice(camera.height, camera.width).points(dtype=torch.float64, device=torch.device("cpu"))
     flow, exists = rectification_flow(*numbers, points, model=camera.model, zoom=zoom)
-    return flow.float(), exists, pinhole
+    return flow.float(), exists, camera.without_lens(zoom=zoom)
 
 
 @cached_constant(maxsize=256)

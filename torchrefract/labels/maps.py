@@ -6,13 +6,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_choice, check_flag, check_flow, check_number, check_tensor
+from torchrefract._validation import check_choice, check_flag, check_flow, check_number, check_tensor, eager_values
 from torchrefract.warping.flow import compose_flows
 from torchrefract.warping.grid import field_dtype, inside
 from torchrefract.warping.warp import sample_image
 
 # Types of the same bits, as torch.gather, and before PyTorch 2.15 torch.where, take no unsigned ones but uint8.
 _SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
+
+_NO_WEIGHT = 1e-3  # of a pixel without a finite value, up to which it does not count
 
 
 def warp_mask(mask: Tensor, flow: Tensor, *, fill: float = 0, soft: bool = False) -> Tensor:
@@ -60,7 +62,8 @@ def warp_depth(
 
     Returns:
         depth: the warped depth map, of the same shape and dtype, without NaN.
-        valid: bool, of the same shape: the nearest input pixel lies in the frame, and no depth used is NaN.
+        valid: bool, of the same shape: the nearest input pixel lies in the frame, and no depth used is NaN. If
+            interpolated, NaN and inf count from a weight of 1/1000 on.
 
     Raises:
         ValueError, TypeError: as for `warp_mask`; an unknown interpolation, a `fill` that is not finite.
@@ -164,7 +167,14 @@ def _warp_map(value: Tensor, flow: Tensor, interpolation: str) -> tuple[Tensor, 
     in_frame = sample_image(ones, flow, padding="zeros", interpolation="nearest") > 0.5
     if not value.is_floating_point() and value.dtype.itemsize >= 4:
         return _nearest_integers(value, flow), in_frame
-    return sample_image(value, flow, padding="border", interpolation=interpolation), in_frame
+    if interpolation == "nearest" or eager_values(value.isfinite().all, of=value):
+        return sample_image(value, flow, padding="border", interpolation=interpolation), in_frame
+    # NaN and infinity times a weight of 0 are NaN, so their weights are sampled on their side.
+    parts = [torch.where(value.isfinite(), value, 0), value.isnan().to(value.dtype), value.isinf().to(value.dtype)]
+    sampled = sample_image(torch.cat(parts, dim=1), flow, padding="border", interpolation="bilinear")
+    finite, nan, infinite = sampled.chunk(3, dim=1)
+    mixed = torch.where(infinite > _NO_WEIGHT, torch.inf, finite)
+    return torch.where(nan > _NO_WEIGHT, torch.nan, mixed), in_frame
 
 
 def _nearest_integers(value: Tensor, flow: Tensor) -> Tensor:

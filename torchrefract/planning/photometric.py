@@ -161,6 +161,8 @@ def plan_image_fog(model: FogErrorModel, request: PhotometricRequest) -> Photome
         weight = sum(model.weights[i] for i in dropped)
         mean = _NOISE_BOUND * min(_NOISE_BOUND * weight, _deviation_of_mean(model, dropped, request))
         smallest = lowest - mean
+        if smallest <= 0:
+            return math.inf
         largest = min(model.thickness, 1e12) / smallest
         y = min(1.0, largest)
         return model.levels(-math.expm1(-largest * weight / 2) + mean / smallest * y * math.exp(-y))

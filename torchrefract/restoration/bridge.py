@@ -69,18 +69,11 @@ class Bridge(AveragedRestoration):
             image = image + self._change(image, point, degraded) / self.steps
         return Restored(image)
 
-    def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at a random point for each sample; each step has its own draws."""
-        return self._loss(batch, 1 + self.global_step), None
-
-    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """Compute the loss with the same draws each time, and the restoration."""
-        return self._loss(batch, 0), self(batch.degraded)
-
-    def _loss(self, pair: Pair, step: int) -> Tensor:
-        point = 1 - uniform(self._stream(pair.key, step), 1)[:, 0]
-        image = torch.lerp(pair.clean, pair.degraded, point.view(-1, 1, 1, 1))
-        return (self._change(image, point, pair.degraded) - (pair.clean - pair.degraded)).abs().mean()
+    def loss_of_step(self, batch: Pair, step: int) -> Tensor:
+        """Compute the loss at a random point for each sample; see `AveragedRestoration.loss_of_step`."""
+        point = 1 - uniform(self._stream(batch.key, step), 1)[:, 0]
+        image = torch.lerp(batch.clean, batch.degraded, point.view(-1, 1, 1, 1))
+        return (self._change(image, point, batch.degraded) - (batch.clean - batch.degraded)).abs().mean()
 
     def _change(self, image: Tensor, point: Tensor, degraded: Tensor) -> Tensor:
         """Predict clean - degraded from images at points (B,) between the two."""

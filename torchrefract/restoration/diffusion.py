@@ -46,6 +46,16 @@ class AveragedRestoration(RestorationModule, ABC):
         """Add the moving average of the weights to a training."""
         return [WeightAveraging(avg_fn=self._average)] if self.trainer.state.fn == TrainerFn.FITTING else []
 
+    @abstractmethod
+    def loss_of_step(self, batch: Pair, step: int) -> Tensor:
+        """Compute the loss () with the draws of a step of the training, 1 or above; those of a validation are of 0."""
+
+    def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
+        return self.loss_of_step(batch, 1 + self.global_step), None
+
+    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
+        return self.loss_of_step(batch, 0), self(batch.degraded, batch.key)
+
     def _average(self, average: Tensor, new: Tensor, count: Tensor) -> Tensor:
         if not average.is_floating_point():  # the counter of a batch normalization
             return new
@@ -131,18 +141,25 @@ class Diffusion(AveragedRestoration):
         """Restore images (B, 3, H, W) in [0, 1]; see `RestorationModule.forward`."""
         return self._sample(degraded, key, steps=self.steps)
 
-    def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at a random level for each sample; each step has its own draws."""
-        source = self._stream(batch.key, 1 + self.global_step)
-        pair, condition = self._crop(batch, conditions(batch.degraded), source.at(0))
-        return self._loss(pair, condition, source, size=batch.clean.shape[2:]), None
-
     def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """Compute the loss on whole frames with the same draws each time, and the restoration."""
-        source = self._stream(batch.key, 0)
-        loss = self._loss(batch, conditions(batch.degraded), source, size=batch.clean.shape[2:])
-        is_training = self.trainer.state.fn == TrainerFn.FITTING
-        return loss, self._sample(batch.degraded, batch.key, steps=self.val_steps if is_training else self.steps)
+        steps = self.val_steps if self.trainer.state.fn == TrainerFn.FITTING else self.steps
+        return self.loss_of_step(batch, 0), self._sample(batch.degraded, batch.key, steps=steps)
+
+    def loss_of_step(self, batch: Pair, step: int) -> Tensor:
+        """Compute the loss at a random level for each sample; see `AveragedRestoration.loss_of_step`."""
+        source, size = self._stream(batch.key, step), batch.clean.shape[2:]
+        pair, condition = batch, conditions(batch.degraded)
+        if step > 0:  # a validation is of whole frames
+            pair, condition = self._crop(pair, condition, source.at(0))
+        target = self.target.encode(pair, size)
+        noise = normal(source.at(1), target)
+        time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
+        noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
+        predicted_noise, predicted_target = self._predict(noisy, time, condition)
+        restored = self.target.decode(predicted_target, pair.degraded, size)
+        noise_error = masked_mean((predicted_noise - noise).abs(), pair.valid)
+        image_error = masked_mean((restored.image - pair.clean).square(), pair.valid)
+        return (_NOISE_WEIGHT * noise_error + self._signal_share(time) * image_error).mean()
 
     def _crop(self, pair: Pair, condition: Tensor, source: Stream) -> tuple[Pair, Tensor]:
         """Cut a square out of each sample; flows that point out of it become invalid."""
@@ -159,18 +176,6 @@ class Diffusion(AveragedRestoration):
 
         degraded, clean, flow, valid = (cut(value) for value in pair[:4])
         return pair._replace(degraded=degraded, clean=clean, flow=flow, valid=valid & inside(flow)), cut(condition)
-
-    def _loss(self, pair: Pair, condition: Tensor, source: Stream, *, size: Sequence[int]) -> Tensor:
-        """Compute the loss of a pair that was cropped from frames of `size` = (height, width)."""
-        target = self.target.encode(pair, size)
-        noise = normal(source.at(1), target)
-        time = (uniform(source.at(2), 1)[:, 0] * NUM_LEVELS).long()
-        noisy = self.levels.add_noise(target, noise, time)  # pyright: ignore[reportArgumentType]  # takes any int tensor
-        predicted_noise, predicted_target = self._predict(noisy, time, condition)
-        restored = self.target.decode(predicted_target, pair.degraded, size)
-        noise_error = masked_mean((predicted_noise - noise).abs(), pair.valid)
-        image_error = masked_mean((restored.image - pair.clean).square(), pair.valid)
-        return (_NOISE_WEIGHT * noise_error + self._signal_share(time) * image_error).mean()
 
     def _predict(self, noisy: Tensor, time: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Predict the noise and the target."""

@@ -48,17 +48,16 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
     # torch.export warns of weights in another memory format.
     program = trace(network.to(memory_format=torch.contiguous_format), images)
     with torch.no_grad():
-        expected = network(images)
-    outputs = [*_TOLERANCES][: len(expected)]
+        expected = dict(zip(_TOLERANCES, network(images), strict=False))
     metadata = {
         "model": loaded.name,
         "task": loaded.task,
         "input": f"image, (B, 3, {height}, {width}), RGB in [0, 1]",
-        "outputs": outputs,
+        "outputs": [*expected],
         "licenses": loaded.licenses,
     }
     with replace_file(out) as path:
-        save_program(program, path, outputs=outputs, metadata=metadata)
+        save_program(program, path, outputs=[*expected], metadata=metadata)
         return _compare(path, images, expected)
 
 
@@ -111,12 +110,12 @@ def start_session(path: Path) -> Any:
     return _import("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
-def _compare(path: Path, images: Tensor, expected: Sequence[Tensor]) -> dict[str, float]:
+def _compare(path: Path, images: Tensor, expected: Mapping[str, Tensor]) -> dict[str, float]:
     """Compare a file with the model for two batch sizes; one of them is not the traced one."""
-    errors, run = dict.fromkeys([*_TOLERANCES][: len(expected)], 0.0), load_program(path)
+    errors, run = dict.fromkeys(expected, 0.0), load_program(path)
     for batch in (slice(0, 2), slice(0, 1)):
-        for name, output, value in zip(errors, run(images[batch]), expected, strict=False):
-            errors[name] = max(errors[name], (output - value[batch]).abs().max().item())
+        for name, output in zip(expected, run(images[batch]), strict=False):
+            errors[name] = max(errors[name], (output - expected[name][batch]).abs().max().item())
     if wrong := [name for name, error in errors.items() if not error <= _TOLERANCES[name]]:
         raise UsageError(f"out must agree with the model, got {wrong[0]} off by {errors[wrong[0]]:.1e}")
     return errors

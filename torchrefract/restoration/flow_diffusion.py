@@ -122,20 +122,13 @@ class FlowDiffusion(AveragedRestoration):
         return restored._replace(deviation=variance.clamp(min=0).sqrt())
 
     def training_loss(self, batch: Pair) -> tuple[Tensor, None]:
-        """Compute the loss at random levels for each sample; each step has its own draws.
-
-        Raises:
-            UsageError: the first batch has no more lenses than there are components.
-        """
+        """Compute the loss; raise UsageError if the first batch has no more lenses than there are components."""
         if not self.components.any():
             self._find_components(batch)
-        return self._loss(batch, 1 + self.global_step), None
+        return super().training_loss(batch)
 
-    def validation_loss(self, batch: Pair) -> tuple[Tensor, Restored]:
-        """Compute the loss with the same draws each time, and the restoration."""
-        return self._loss(batch, 0), self(batch.degraded, batch.key)
-
-    def _loss(self, batch: Pair, step: int) -> Tensor:
+    def loss_of_step(self, batch: Pair, step: int) -> Tensor:
+        """Compute the loss at random levels for each sample; see `AveragedRestoration.loss_of_step`."""
         source, features = self._stream(batch.key, step), cast(Any, self.network).encode(batch.degraded)
         variance = self.components.square().sum(dim=1)
         with without_autocast(batch.flow.device):

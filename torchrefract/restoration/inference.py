@@ -101,13 +101,9 @@ class LensRestorer:
         self.interpolation = check_choice("interpolation", interpolation, INTERPOLATIONS)
         self._flow = lru_cache(maxsize=2)(lambda h, w: camera_flow(camera.resized(width=w, height=h))[0])
 
-    def __call__(self, images: Sequence[Tensor]) -> list[Tensor]:
-        """Restore pictures (3, H, W) in [0, 1]."""
-        return [restored.image[0] for restored in self.restore(images)]
-
     @torch.inference_mode()
     def restore(self, images: Sequence[Tensor]) -> list[Restored]:
-        """Restore pictures (3, H, W) as batches of one, with the flow."""
+        """Restore pictures (3, H, W) in [0, 1] as batches of one, with the flow."""
         flows = [self._flow(*image.shape[1:]).to(image.device, image.dtype) for image in images]
         options = {"padding": "border", "interpolation": self.interpolation}
         pairs = zip(images, flows, strict=True)

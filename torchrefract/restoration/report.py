@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
@@ -19,7 +19,16 @@ from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, make_folder, matching_files, read_bytes, replace_file, write_file
+from torchrefract._io import (
+    as_path,
+    is_remote,
+    make_folder,
+    matching_files,
+    read_bytes,
+    write_csv,
+    write_figure,
+    write_file,
+)
 from torchrefract.data.drive_lenses import bent_drives
 from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.module import PairData, fingerprint
@@ -117,8 +126,8 @@ class RunSummary(Callback):
         height, width = pl_module.metric_size
         # With fast_dev_run, the logger writes no metrics.
         if stage == "fit" and any(metrics_rows(self.run_dir)):
-            save_figure(plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"), self.run_dir / "curves.png")
-        save_figure(draw_panel(*self._examples), self.run_dir / "panel.png")
+            write_figure(self.run_dir / "curves.png", plot_curves(self.run_dir, epe_unit=f"px at {width}x{height}"))
+        write_figure(self.run_dir / "panel.png", draw_panel(*self._examples))
         data = getattr(trainer, "datamodule", None)
         border = border_name(data) if isinstance(data, PairData) else ""
         print("\n".join(summary(trainer.callback_metrics, pl_module.metric_size, border=border)))
@@ -129,12 +138,6 @@ class RunSummary(Callback):
     def _files(self) -> str:
         names = sorted(path.name for path in matching_files(self.run_dir, "[!.]*") if path.is_file())
         return f"{self.run_dir}: {', '.join(names)}"
-
-
-def save_figure(figure: Figure, out: Path) -> None:
-    """Write a figure; the file is replaced only by a complete one."""
-    with replace_file(out) as path:
-        figure.savefig(path)
 
 
 def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
@@ -274,7 +277,7 @@ class MetricsLogger(CSVLogger):
         if not is_remote(run := as_path(self.log_dir)):
             super().save()
         elif rows := self.experiment.metrics:
-            _write_rows(run / METRICS, rows)
+            write_csv(run / METRICS, rows)
 
 
 def carry_over(resumed: Path, run: Path, *, before_epoch: float = math.inf) -> None:
@@ -283,15 +286,7 @@ def carry_over(resumed: Path, run: Path, *, before_epoch: float = math.inf) -> N
     # A row that is in both tables counts once.
     rows = [dict(row) for row in dict.fromkeys(tuple(pair for pair in row.items() if pair[1]) for row in complete)]
     if rows:
-        _write_rows(run / METRICS_BEFORE, rows)
-
-
-def _write_rows(target: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with replace_file(target) as path, path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+        write_csv(run / METRICS_BEFORE, rows)
 
 
 def _epoch_of(row: dict[str, str]) -> float:

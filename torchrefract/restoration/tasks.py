@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._tensor import as_device_tensor
+from torchrefract._tensor import as_device_tensor, pad_to_multiple
 from torchrefract._validation import check_choice, check_flag
 from torchrefract.restoration.metrics import masked_mean
 from torchrefract.types import Pair
@@ -145,11 +145,10 @@ class Deweather(Task):
 
 def _average_cells(prediction: Tensor, degraded: Tensor) -> Tensor:
     """Average a prediction of pixels over cells; return a prediction of cells unchanged."""
-    height, width = degraded.shape[2:]
-    if prediction.shape[2:] != (height, width):
+    if prediction.shape[2:] != degraded.shape[2:]:
         return prediction
-    # Pad to full cells. Otherwise the flow would be stretched along a side that 4 does not divide.
-    return F.avg_pool2d(F.pad(prediction, (0, -width % _CELL, 0, -height % _CELL), mode="replicate"), _CELL)
+    # Without full cells, the flow would be stretched along a side that 4 does not divide.
+    return F.avg_pool2d(pad_to_multiple(prediction, _CELL), _CELL)
 
 
 def _interpolate_cells(cells: Tensor, degraded: Tensor) -> Tensor:

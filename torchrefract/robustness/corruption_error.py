@@ -34,7 +34,7 @@ def compare_with_base(result: Robustness, base: Robustness, *, folder: str, mode
     """Compute the `corruption_error` of each scene and their mean, beside a base of a folder and a model."""
     count = len(images_of_both(result, base))
     left_out, left_out_of_base = (len(run.names) - count for run in (result, base))
-    scenes = {scene: corruption_error(result, base, scene) for scene in {level.scene: None for level in result.scores}}
+    scenes = {scene: corruption_error(result, base, scene) for scene in result.scenes}
     return BaseComparison(folder, model, count, left_out, left_out_of_base, scenes, float(np.mean([*scenes.values()])))
 
 
@@ -61,12 +61,10 @@ def corruption_error(result: Robustness, base: Robustness, scene: str | None = N
     Source: Hendrycks and Dietterich, "Benchmarking neural network robustness to common corruptions and perturbations",
     ICLR 2019, which states it in %.
     """
-    scenes = list(dict.fromkeys(level.scene for level in result.scores))
-    if scene is not None and scene not in scenes:
-        raise ValueError(f"scene must be one of {', '.join(scenes)}, got {scene}")
+    scenes = result.scenes_or_all(scene)
     names = images_of_both(result, base)
     _check_base(result, base, names)
-    return float(np.mean([_error_ratio(result, base, names, of) for of in (scenes if scene is None else [scene])]))
+    return float(np.mean([_error_ratio(result, base, names, of) for of in scenes]))
 
 
 def images_of_both(result: Robustness, base: Robustness) -> list[str]:

@@ -127,6 +127,17 @@ class Robustness:
     worst_case: dict[Level, np.ndarray] = field(default_factory=dict)
     worst_seeds: dict[Level, np.ndarray] = field(default_factory=dict)
 
+    @property
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes."""
+        return list(dict.fromkeys(level.scene for level in self.scores))
+
+    def scenes_or_all(self, scene: str | None) -> list[str]:
+        """Return one scene, or all for None; raise ValueError for a scene that was not scored."""
+        if scene is not None and scene not in self.scenes:
+            raise ValueError(f"scene must be one of {', '.join(self.scenes)}, got {scene}")
+        return self.scenes if scene is None else [scene]
+
     def rows(self) -> list[Row]:
         """Return the scores by level, with 95 % intervals by resampling of the images."""
         rows = []
@@ -178,13 +189,10 @@ class Robustness:
 
         Source: Michaelis et al., "Benchmarking robustness in object detection", 2019.
         """
-        scenes = list(dict.fromkeys(level.scene for level in self.scores))
-        if scene is not None and scene not in scenes:
-            raise ValueError(f"scene must be one of {', '.join(scenes)}, got {scene}")
+        scenes = self.scenes_or_all(scene)
         names = ["score", *(["worst_case"] if self.worst_case else []), *self.set_scores.get(None, ())]
         if of not in names:
             raise ValueError(f"of must be one of {', '.join(names)}, got {of}")
-        scenes = scenes if scene is None else [scene]
         means = [np.mean([self._value(of, level) for level in self.scores if level.scene == s]) for s in scenes]
         return float(np.mean(means))
 
@@ -259,38 +267,41 @@ def evaluate(
     batch_size = check_count("batch_size", batch_size)
     scored: dict[str, Scored] = {}
     failures: dict[str, str] = {}
-    for name, image, given in samples:
-        _check_sample(name, image, scored, failures)
-        if name in done:
-            scored[name] = _checked_done(name, done[name], num_draws)
-            continue
-        if given is None and as_target is None:
+
+    def score_image(name: str, image: Tensor, target: Any) -> Scored:
+        if target is None and as_target is None:
             raise ValueError(f"target must be labels, or as_target a function, got None for {name}")
         by_name = _checked_scenes(
             scenes(image.shape[-1]) if callable(scenes) and not isinstance(scenes, Effect) else scenes
         )
+        (prediction,) = _predict(predict, [image])
+        if target is None and as_target is not None:
+            target = as_target(prediction, (image.shape[-2], image.shape[-1]))
+        clean = _score(score, prediction, target)
+        draws: dict[Level, list[ImageScore]] = {}
+        options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
+        with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
+            while batch := list(itertools.islice(pictures, batch_size)):
+                predictions = _predict(predict, [degraded.image for _, degraded, _ in batch])
+                for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
+                    quantity = quantities.get(level.scene)
+                    value = quantity.get(degraded.params).item() if quantity else 0.0
+                    draws.setdefault(level, []).append(_score(score, prediction, moved, value))
+        return Scored(clean, {level: _with_worst_case(of, seed) for level, of in draws.items()})
+
+    for name, image, target in samples:
+        _check_sample(name, image, scored, failures)
+        if name in done:
+            if num_draws > 1 and any(of.worst_case is None for of in done[name].levels.values()):
+                raise ValueError(f"done must have worst cases, got none for {name}; score it again")
+            scored[name] = done[name]
+            continue
         try:
-            (prediction,) = _predict(predict, [image])
-            target = given
-            if given is None and as_target is not None:
-                target = as_target(prediction, (image.shape[-2], image.shape[-1]))
-            clean = _score(score, prediction, target)
-            draws: dict[Level, list[ImageScore]] = {}
-            options = {"keys": [random.key_of(name)], "depth": depth and depth(name, image)}
-            with closing(_degraded(image, target, by_name, range(seed, seed + num_draws), options)) as pictures:
-                while batch := list(itertools.islice(pictures, batch_size)):
-                    predictions = _predict(predict, [degraded.image for _, degraded, _ in batch])
-                    for (level, degraded, moved), prediction in zip(batch, predictions, strict=True):
-                        quantity = quantities.get(level.scene)
-                        value = quantity.get(degraded.params).item() if quantity else 0.0
-                        draws.setdefault(level, []).append(_score(score, prediction, moved, value))
-            by_level = {level: _with_worst_case(of, seed) for level, of in draws.items()}
-        except _PredictionError as error:
-            failures[name] = str(error)
-        else:
-            scored[name] = Scored(clean, by_level)
+            scored[name] = score_image(name, image, target)
             if on_scored is not None:
                 on_scored(name, scored[name])
+        except _PredictionError as error:
+            failures[name] = str(error)
         if _fails_too_often(len(failures), len(scored)):
             break
     if not scored or _fails_too_often(len(failures), len(scored)):
@@ -324,13 +335,6 @@ def _check_sample(name: Any, image: Any, *earlier: Mapping[str, Any]) -> None:
     if not isinstance(image, Tensor) or image.ndim != 3:
         got = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
         raise ValueError(f"samples must have images (3, H, W), tensors, got {got} for {name}")
-
-
-def _checked_done(name: str, scored: Scored, num_draws: int) -> Scored:
-    """Return the scores of an image; raise ValueError if they lack worst cases."""
-    if num_draws > 1 and any(of.worst_case is None for of in scored.levels.values()):
-        raise ValueError(f"done must have worst cases, got none for {name}; score it again")
-    return scored
 
 
 def _checked_scenes(scenes: Any) -> Scenes:
@@ -411,9 +415,7 @@ def _collect(
         scores={level: np.array([of.score for of in of_level[level]]) for level in levels},
         values={level: np.array([of.value for of in of_level[level]]) for level in levels if level.scene in quantities},
         set_scores={level: set_scores([of.summary for of in images]) for level, images in of_level.items()},
-        quantities={
-            scene: quantities[scene] for scene in {level.scene: None for level in levels} if scene in quantities
-        },
+        quantities={level.scene: quantities[level.scene] for level in levels if level.scene in quantities},
         failures=dict(failures),
         worst_case={level: np.array([of.worst_case for of in of_level[level]]) for level in searched},
         worst_seeds={level: np.array([of.worst_seed for of in of_level[level]]) for level in searched},

@@ -74,7 +74,7 @@ def load_predictor(model: str, *, weights: str | None = None, device: str = "cpu
     elif Path(model).suffix in _PROGRAMS:
         predict = _load_program(Path(model), device)
     elif model == "opencv:hog":
-        predict = HogDetector()
+        predict = _load_hog()
     elif name:
         predict = import_function(kind, name, device)
     else:
@@ -105,26 +105,21 @@ def model_files(model: str) -> list[str]:
     return [str(file) for file in files if file.is_file()]
 
 
-class HogDetector:
-    """The pedestrian detector of OpenCV: boxes of class 1."""
+def _load_hog() -> Predict:
+    """Return the pedestrian detector of OpenCV: boxes of class 1."""
+    hog = cv2.HOGDescriptor()
+    hog.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
 
-    def __init__(self) -> None:
-        self._hog = cv2.HOGDescriptor()
-        self._hog.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector(), np.float32))
-
-    def __call__(self, images: Tensor) -> list[dict[str, Tensor]]:
-        """Detect pedestrians in images (B, 3, H, W)."""
-        return [self._detect(image.movedim(0, -1).cpu().numpy()) for image in to_uint8(images)]
-
-    def _detect(self, image: np.ndarray) -> dict[str, Tensor]:
-        corners, weights = (), ()
-        (width, height), image = self._hog.winSize, np.ascontiguousarray(image[..., ::-1])
+    def detect(image: np.ndarray) -> dict[str, Tensor]:
+        corners, weights, (width, height) = (), (), hog.winSize
         if image.shape[0] >= height and image.shape[1] >= width:  # OpenCV reads beyond the memory of smaller ones
-            corners, weights = self._hog.detectMultiScale(image, winStride=(8, 8), scale=1.05)
+            corners, weights = hog.detectMultiScale(image, winStride=(8, 8), scale=1.05)
         corners = torch.tensor(np.array(corners, np.float32).reshape(-1, 4))
         scores = torch.tensor(np.array(weights, np.float32).reshape(-1)) / _HOG_SCALE
         boxes = torch.cat([corners[:, :2], corners[:, :2] + corners[:, 2:]], dim=1)
         return {"boxes": boxes, "labels": torch.ones(len(boxes), dtype=torch.int64), "scores": scores.clamp(0, 1)}
+
+    return lambda images: [detect(image) for image in _bgr_arrays(images)]
 
 
 def _load_torchvision(name: str, weights: str | None, device: str) -> Predict:
@@ -196,12 +191,16 @@ def _load_ultralytics(name: str, device: str) -> Predict:
 
     def predict(images: Tensor) -> list[dict[str, Tensor]]:
         # Arrays are padded to the size of the network like files; tensors are taken as they are.
-        arrays = list(to_uint8(images).flip(1).movedim(1, -1).contiguous().cpu().numpy())  # BGR
-        results = network.predict(arrays, conf=_LEAST_SCORE, device=device, verbose=False)
+        results = network.predict(_bgr_arrays(images), conf=_LEAST_SCORE, device=device, verbose=False)
         boxes = [result.boxes for result in results]
         return [{"boxes": box.xyxy, "labels": box.cls.long(), "scores": box.conf} for box in boxes]
 
     return predict
+
+
+def _bgr_arrays(images: Tensor) -> list[np.ndarray]:
+    """Return images (B, 3, H, W) as arrays (H, W, 3), uint8, in OpenCV's order of colors."""
+    return list(to_uint8(images).flip(1).movedim(1, -1).contiguous().cpu().numpy())
 
 
 @contextmanager

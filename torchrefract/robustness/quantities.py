@@ -16,6 +16,11 @@ from torchrefract.effects.sun_glare import SunGlare
 from torchrefract.robustness.evaluate import Quantity
 from torchrefract.types import Range
 
+# Those of torchrefract.presets that have a quantity.
+SCENES = (
+    *("cheap_dashcam", "cape_town_fog", "night_fog", "limpopo_sun_glare"),
+    *("highveld_heat_haze", "highveld_telephoto", "unpaved_road"),
+)
 _VISIBILITY = Quantity("visibility", "m", False, lambda params: params.visibility)
 _OF_EFFECTS: dict[type[Effect], Quantity] = {
     UniformFog: _VISIBILITY,
@@ -41,8 +46,10 @@ def _quantity(effect: Effect) -> Quantity | None:
     if effect.p < 1:
         return None
     if isinstance(effect, Compose) and not isinstance(effect, OneOf):
-        quantities = ((i, _quantity(child)) for i, child in enumerate(cast(Iterable[Effect], effect.effects)))
-        return next((_of_child(i, quantity) for i, quantity in quantities if quantity), None)
+        for i, child in enumerate(cast(Iterable[Effect], effect.effects)):
+            if quantity := _quantity(child):
+                return quantity._replace(get=_GetOfChild(i, quantity.get))
+        return None
     if isinstance(effect, LensDistortion) and (effect._source or max(cast(Range, effect.k1_range)) > 0):
         return None
     return _OF_EFFECTS.get(type(effect))
@@ -56,20 +63,3 @@ class _GetOfChild(NamedTuple):
 
     def __call__(self, params: Any) -> Tensor:
         return self.get(params.children[self.child])
-
-
-def _of_child(index: int, quantity: Quantity) -> Quantity:
-    """Return the quantity of a composition that is that of a child."""
-    return quantity._replace(get=_GetOfChild(index, quantity.get))
-
-
-# Of torchrefract.presets.
-QUANTITIES = {
-    "cheap_dashcam": _OF_EFFECTS[LensDistortion],
-    "cape_town_fog": _VISIBILITY,
-    "night_fog": _of_child(0, _VISIBILITY),
-    "limpopo_sun_glare": _OF_EFFECTS[SunGlare],
-    "highveld_heat_haze": _of_child(0, _OF_EFFECTS[RoadMirage]),
-    "highveld_telephoto": _of_child(0, _OF_EFFECTS[PhysicalTurbulence]),
-    "unpaved_road": _of_child(0, _VISIBILITY),
-}

@@ -1,7 +1,6 @@
 """The report of a robustness test: tables of numbers, and one HTML file that opens anywhere."""
 
 import base64
-import csv
 import html
 import io
 import json
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from torchrefract._io import replace_file, write_file
+from torchrefract._io import write_csv, write_file
 from torchrefract.data.images import pixels_of
 from torchrefract.robustness.corruption_error import BaseComparison
 from torchrefract.robustness.evaluate import Robustness, Row
@@ -35,7 +34,9 @@ figcaption { font-size: 13px; max-width: 29rem; }
 """
 _OF_RUN = ("metric", "seed", "torchrefract", "torch")  # columns that are the same in all lines
 _SPACING = 0.08  # of the curves, severities
-_NUM_COLORS, _OPACITY, _SEEN_SHARE = 20, 0.5, 0.002  # of classes
+_OPACITY, _SEEN_SHARE = 0.5, 0.002  # of classes
+# Neighbors of tab20 are pairs of a dark and a light color: the dark ones come first.
+_PALETTE = [tuple(round(255 * value) for value in colormaps["tab20"](2 * (i % 10) + i // 10)[:3]) for i in range(20)]
 _COLORS = {"labels": (40, 160, 60), "predictions": (220, 40, 30)}
 
 
@@ -75,10 +76,7 @@ def write_tables(
         comparison: the errors relative to those of a base, or None.
     """
     rows = [_flat(row) for row in result.rows()]
-    with replace_file(out / "results.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*dict.fromkeys(name for row in rows for name in row), *_OF_RUN])
-        writer.writeheader()
-        writer.writerows(row | {name: about[name] for name in _OF_RUN} for row in rows)
+    write_csv(out / "results.csv", [row | {name: about[name] for name in _OF_RUN} for row in rows])
     summary = {
         "about": about,
         "clean": result.clean_estimate()._asdict(),
@@ -190,11 +188,10 @@ def _flat(row: Row) -> dict[str, Any]:
 
 def _worst_cases(result: Robustness) -> dict[str, dict[str, float]]:
     """Return the mean score and the mean worst case of each scene, and of all."""
-    scenes = list(dict.fromkeys(level.scene for level in result.worst_case))
     kinds = {"mean_performance": "score", "worst_case": "worst_case"}
     return {
         scene or "all scenes": {name: result.mean_performance(scene, of=of) for name, of in kinds.items()}
-        for scene in [*scenes, None]
+        for scene in [*result.scenes, None]
     }
 
 
@@ -211,10 +208,9 @@ def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
     """Draw the score, with intervals, or one of all images together."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
-    scenes = list(dict.fromkeys(level.scene for level in result.scores))
-    for i, scene in enumerate(scenes):
+    for i, scene in enumerate(result.scenes):
         of_scene = [row for row in rows if row.scene == scene]
-        shift = _SPACING * (i - (len(scenes) - 1) / 2)  # so that equal scores do not hide one another
+        shift = _SPACING * (i - (len(result.scenes) - 1) / 2)  # so that equal scores do not hide one another
         x = [row.severity + shift for row in of_scene]
         if of == "score":
             y = np.array([row.score for row in of_scene])
@@ -238,7 +234,7 @@ def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
         text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
         value, _, interval = text.partition("[")
         cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
-    others = dict.fromkeys(level.scene for level in result.scores if level.scene not in result.quantities)
+    others = [scene for scene in result.scenes if scene not in result.quantities]
     return cells + [(scene, "", "", "none, see the scores by severity") for scene in others]
 
 
@@ -306,8 +302,7 @@ def _with_boxes(example: Example) -> Image.Image:
 
 def _with_classes(prediction: Classes) -> Image.Image:
     """Draw the classes of an image half-transparent over it."""
-    palette = np.array([_class_color(i) for i in range(_NUM_COLORS)], np.uint8)
-    colors = palette[prediction.classes.long().cpu().numpy() % _NUM_COLORS]
+    colors = np.array(_PALETTE, np.uint8)[prediction.classes.long().cpu().numpy() % len(_PALETTE)]
     return Image.blend(Image.fromarray(pixels_of(prediction.image)), Image.fromarray(colors), _OPACITY)
 
 
@@ -318,17 +313,11 @@ def _legend(*predictions: Tensor) -> str:
         for name, count in zip(*(of.tolist() for of in classes.long().unique(return_counts=True)), strict=True):
             shares[name] = max(shares.get(name, 0.0), count / classes.numel())
     parts = [
-        f'<span class="class" style="background: rgb{_class_color(name % _NUM_COLORS)}"></span>{name}'
+        f'<span class="class" style="background: rgb{_PALETTE[name % len(_PALETTE)]}"></span>{name}'
         for name, share in sorted(shares.items())
         if share >= _SEEN_SHARE
     ]
     return f"<br>classes {' '.join(parts)}"
-
-
-def _class_color(index: int) -> tuple[int, int, int]:
-    # Neighbors of this map are pairs of a dark and a light color.
-    red, green, blue = (round(255 * value) for value in colormaps["tab20"](2 * (index % 10) + index // 10)[:3])
-    return red, green, blue
 
 
 def _jpeg(picture: Image.Image) -> str:

@@ -33,14 +33,13 @@ _NUM_SAMPLED = 5  # frames that decide the scale of a map and the palette of a G
 _PALETTE_COLORS = 254  # of 256: one is white, one is the transparent color of unchanged pixels
 _DITHER = 8.0  # of 255, range of the dither matrix
 
-DepthSource = Tensor | Callable[[int], Tensor] | None  # (1, 1, H, W), m, of all frames or, by a function, of frame t
-
 
 class FrameSequence(NamedTuple):
     """Frames of one size, read when they are needed."""
 
     num_frames: int
     read: Callable[[Iterable[int]], Iterator[tuple[int, Tensor]]]  # rising numbers t -> (t, frame (1, 3, H, W))
+    depth: Callable[[int], Tensor] | None = None  # number t -> (1, 1, H, W), m, for effects that depend on it
 
 
 class Panel(NamedTuple):
@@ -61,13 +60,12 @@ class Animation:
     layout: FigureLayout
     background: np.ndarray  # (height, width, 3), uint8, both even: texts and legends, which do not change
     seed: int
-    depth: DepthSource
 
     def render(self, times: Iterable[int]) -> Iterator[np.ndarray]:
         """Render the pictures (height, width, 3), uint8, at rising times, one by one."""
         largest = _largest_side(len(self.panels))
         for t, frame in self.frames.read(times):
-            picture, depth = self.background.copy(), _depth_at(self.depth, t)
+            picture, depth = self.background.copy(), self.frames.depth and self.frames.depth(t)
             for i, panel in enumerate(self.panels):
                 degraded = _degrade(panel.name, panel.effect, frame, self.seed, depth, t)
                 images = [resize_for_display(degraded.image, largest=largest)[0]]
@@ -84,16 +82,13 @@ class Animation:
         return self.layout.left(2 * pair + column), self.layout.top(row)
 
 
-def make_animation(
-    effects: Mapping[str, Effect], frames: FrameSequence, *, seed: int, depth: DepthSource = None
-) -> Animation:
-    """Prepare an animation whose frame t is `effect.degrade(frame, seed=seed, depth=depth, frame=t)`.
+def make_animation(effects: Mapping[str, Effect], frames: FrameSequence, *, seed: int) -> Animation:
+    """Prepare an animation whose frame t is `effect.degrade(frame, seed=seed, depth=frames.depth(t), frame=t)`.
 
     Args:
         effects: at least one, by name.
         frames: at least one.
         seed: of the draws.
-        depth: (1, 1, H, W), m, of all frames, or a function that gives that of frame t, for effects that depend on it.
 
     Raises:
         UsageError: if an effect cannot degrade the frames; the message names the effect.
@@ -102,15 +97,15 @@ def make_animation(
     height = width = 0
     for t, frame in frames.read(_sample_times(frames.num_frames)):
         height, width = resize_for_display(frame, largest=_largest_side(len(effects))).shape[2:]
-        depth_then = _depth_at(depth, t)
+        depth = frames.depth and frames.depth(t)
         for name, effect in effects.items():
-            degraded = _degrade(name, effect, frame, seed, depth_then, t)
+            degraded = _degrade(name, effect, frame, seed, depth, t)
             scales, caption = map_scales(degraded), f"{name}: {describe_params(effect, degraded.params)}"
             panel, tops = panels.setdefault(name, Panel(name, effect, caption, scales)), dict(scales)
             larger = (scale._replace(top=max(scale.top, tops.get(scale.name, scale.top))) for scale in panel.scales)
             panels[name] = panel._replace(scales=tuple(larger))
     layout, background = _draw_background([*panels.values()], height, width)
-    return Animation([*panels.values()], frames, layout, background, seed, depth)
+    return Animation([*panels.values()], frames, layout, background, seed)
 
 
 def animation_formats() -> list[str]:
@@ -160,10 +155,6 @@ def _largest_side(num_effects: int) -> int:
 def _sample_times(num_frames: int) -> list[int]:
     """Return a few frame numbers, spread evenly from the first to the last."""
     return np.unique(np.linspace(0, num_frames - 1, _NUM_SAMPLED, dtype=int)).tolist()
-
-
-def _depth_at(depth: DepthSource, t: int) -> Tensor | None:
-    return depth(t) if callable(depth) else depth
 
 
 def _degrade(name: str, effect: Effect, frame: Tensor, seed: int, depth: Tensor | None, t: int) -> Degraded:

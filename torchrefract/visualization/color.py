@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchrefract._validation import check_count, check_flow, check_positive
+from torchrefract._validation import check_count, check_flow, check_map, check_positive
 
 _WHEEL_COLORS = ((1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1), (1, 0, 1), (1, 0, 0))
 _WHEEL_HUES = (0, 15, 21, 25, 36, 49, 55)  # position of each color among the 55 hues of the wheel
@@ -124,7 +124,7 @@ def transmission_to_rgb(transmission: Tensor) -> Tensor:
 
     Source: viridis, by Smith, van der Walt and Firing (2015), released under CC0.
     """
-    _check_map("transmission", transmission, channels=1)
+    check_map("transmission", transmission, channels=1)
     value = _to_float(transmission)[:, 0]
     is_number = ~value.isnan()
     knots = torch.linspace(0, 1, len(_VIRIDIS), dtype=value.dtype, device=value.device)
@@ -164,7 +164,7 @@ def hatch_invalid(image: Tensor, valid: Tensor) -> Tensor:
         stripe(row, column) = 0.86 if (row + column) mod period < period / 2, else 0.62
         period = max(8, max(H, W) / 40)
     """
-    _check_map("image", image, channels=3)
+    check_map("image", image, channels=3)
     _check_mask("valid", valid, image, any_size=True)
     height, width = image.shape[2:]
     period = max(8, max(height, width) // 40)
@@ -186,7 +186,7 @@ def mark_folded(image: Tensor, folded: Tensor) -> Tensor:
 
         out = 0.25 image + 0.75 (1, 0, 1)
     """
-    _check_map("image", image, channels=3)
+    check_map("image", image, channels=3)
     _check_mask("folded", folded, image, any_size=True)
     marked = F.adaptive_max_pool2d(folded.to(image.device, torch.float32), image.shape[2:]) > 0
     magenta = image.new_tensor(_MAGENTA).view(3, 1, 1)
@@ -204,13 +204,6 @@ def _interpolate(value: Tensor, knots: Tensor, colors: Tensor) -> Tensor:
 def _to_float(value: Tensor) -> Tensor:
     """Detach and convert half types to float32, in which squares do not overflow."""
     return value.detach().to(torch.promote_types(value.dtype, torch.float32))
-
-
-def _check_map(name: str, value: Tensor, *, channels: int) -> None:
-    if value.ndim != 4 or value.shape[1] != channels:
-        raise ValueError(f"{name} must have shape (B, {channels}, H, W), got {tuple(value.shape)}")
-    if not value.is_floating_point():
-        raise TypeError(f"{name} must be of a floating type, got {value.dtype}")
 
 
 def _check_mask(name: str, value: Tensor, image: Tensor, *, any_size: bool = False) -> None:

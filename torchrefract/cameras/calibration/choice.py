@@ -80,6 +80,5 @@ def is_one_to_one(camera: Camera) -> bool:
     """Return True if the camera shows a ray in all of its frame, and in all of its rectified frame."""
     if camera.coverage() < 1:
         return False
-    grid = camera.grid(_GRID)
-    points = (grid - grid.new_tensor([camera.cx, camera.cy])) / grid.new_tensor([camera.fx, camera.fy])
-    return bool(camera.distort(points).valid.all())
+    rays = camera.without_lens().unproject(camera.grid(_GRID)).points
+    return bool(camera.project(rays).valid.all())

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchrefract._io import replace_file, write_file
+from torchrefract._io import write_figure, write_file
 from torchrefract.cameras.calibration.boards import Board
 from torchrefract.cameras.calibration.choice import AUTO, FOLDS, Candidate, choose_model
 from torchrefract.cameras.calibration.detection import Detection, View
@@ -115,8 +115,7 @@ def write_report(calibration: Calibration, read_gray: Callable[[str], np.ndarray
     """Write report.md and its figures; `read_gray` returns (H, W), uint8, by the name of a view."""
     figures = _draw_coverage(calibration), _draw_residuals(calibration, read_gray), _draw_uncertainty(calibration.fit)
     for name, figure in zip(_FIGURES, figures, strict=True):
-        with replace_file(folder / name) as path:
-            figure.savefig(path)
+        write_figure(folder / name, figure)
     write_file(folder / REPORT_FILE, _report(calibration) + "\n")
 
 

@@ -44,9 +44,9 @@ def rectified_deviation(camera: Camera, covariance: np.ndarray, pixels: np.ndarr
 
 def undistort_pixels(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (N, 2) as the camera's pinhole shows them, and (N,), bool: it shows them."""
-    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    points, valid, _ = camera.undistort(torch.from_numpy((pixels - center) / focal))
-    return points.numpy() * focal + center, valid.numpy()
+    rays, has_ray, _ = camera.unproject(torch.from_numpy(pixels))
+    rectified, is_shown, _ = camera.without_lens().project(rays)
+    return rectified.numpy(), (has_ray & is_shown).numpy()
 
 
 class Crop(NamedTuple):
@@ -77,13 +77,9 @@ def certain_part(camera: Camera, covariance: np.ndarray, pinhole: Camera) -> tup
         pinhole: of the rectified frame.
     """
     grid = pinhole.grid(_GRID)
-    center, focal = _numbers(pinhole.cx, pinhole.cy), _numbers(pinhole.fx, pinhole.fy)
-    sources = camera.distort((grid - center) / focal)
-    pixels = sources.points * _numbers(camera.fx, camera.fy) + _numbers(camera.cx, camera.cy)
-    scale = pinhole.fx / camera.fx
+    pixels, shown = (value.numpy() for value in camera.project(pinhole.unproject(grid).points)[:2])
     deviation = np.full(len(grid), np.nan)
-    shown = sources.valid.numpy()
-    deviation[shown] = scale * rectified_deviation(camera, covariance, pixels.numpy()[shown])
+    deviation[shown] = pinhole.fx / camera.fx * rectified_deviation(camera, covariance, pixels[shown])
     middle = (np.array([pinhole.width, pinhole.height]) - 1) / 2
     distance = (np.abs(grid.numpy() - middle) / middle).max(axis=1)
     is_vague = deviation > MAX_DEVIATION_PX
@@ -92,7 +88,3 @@ def certain_part(camera: Camera, covariance: np.ndarray, pinhole: Camera) -> tup
     width, height = (int(size * side) // 2 * 2 for size in (pinhole.width, pinhole.height))
     crop = Crop((pinhole.width - width) // 2, (pinhole.height - height) // 2, width, height)
     return float(np.nanmax(deviation, initial=0.0)), crop
-
-
-def _numbers(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64, device="cpu")

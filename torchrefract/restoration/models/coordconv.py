@@ -10,7 +10,6 @@ from typing import Any
 import segmentation_models_pytorch as smp
 import timm
 import torch
-import torch.nn.functional as F
 from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import HfHubHTTPError
 from safetensors import SafetensorError
@@ -18,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchrefract._tensor import without_autocast
+from torchrefract._tensor import pad_to_multiple, without_autocast
 from torchrefract._validation import check_rgb, warn
 from torchrefract.warping.grid import pixel_axes
 
@@ -118,8 +117,8 @@ class CoordConvSegmenter(nn.Module):
         check_rgb("image", image)
         height, width = image.shape[2:]
         inputs = torch.cat([(image - self.mean) / self.std, pixel_coordinates(image)], dim=1)
-        inputs = F.pad(inputs, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
-        features = self.network.encoder(inputs.contiguous(memory_format=torch.channels_last))
+        inputs = pad_to_multiple(inputs, _STRIDE).contiguous(memory_format=torch.channels_last)
+        features = self.network.encoder(inputs)
         maps = self.network.segmentation_head(self.network.decoder(features))
         maps = maps[:, :, : -(-height // self.cell), : -(-width // self.cell)]
         if self.polynomial_head is None:

@@ -4,10 +4,10 @@ import json
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from diffusers import UNet2DModel
 from torch import Tensor, nn
 
+from torchrefract._tensor import pad_to_multiple
 from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.restoration.models.lens_net import LENS_FEATURES, LensEncoder
@@ -87,8 +87,7 @@ class Denoiser(nn.Module):
             condition: (B, 5, H, W), as of `conditions`.
         """
         height, width = noisy.shape[2:]
-        inputs = torch.cat([noisy, condition], dim=1)
-        inputs = F.pad(inputs, (0, -width % self.stride, 0, -height % self.stride), mode="replicate")
+        inputs = pad_to_multiple(torch.cat([noisy, condition], dim=1), self.stride)
         return self.network(inputs, time).sample[:, :, :height, :width].float()
 
 

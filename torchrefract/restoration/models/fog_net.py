@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from torchrefract._tensor import pad_to_multiple
 from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.warping.grid import field_dtype
@@ -66,8 +67,7 @@ class FogNet(nn.Module):
         difference = image - airlight
         logarithm = (difference.abs().amax(dim=1, keepdim=True) + _LEVEL).log()
         parts = [4 * difference, 4 * airlight.expand_as(image) - 2, logarithm / 2 + 1, pixel_coordinates(image)]
-        inputs = F.pad(torch.cat(parts, dim=1), (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
-        inputs = inputs.contiguous(memory_format=torch.channels_last)
+        inputs = pad_to_multiple(torch.cat(parts, dim=1), _STRIDE).contiguous(memory_format=torch.channels_last)
         scales = [inputs]
         for layer in self.down:
             scales.append(layer(scales[-1]))

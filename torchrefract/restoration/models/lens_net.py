@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrefract._tensor import without_autocast
+from torchrefract._tensor import pad_to_multiple, without_autocast
 from torchrefract._validation import check_count, check_rgb
 from torchrefract.restoration.models.coordconv import PolynomialFlowHead, cell_axes, pixel_coordinates
 
@@ -132,7 +132,7 @@ def find_edges(image: Tensor) -> tuple[Edges, Tensor]:
     Source: Bigün, Granlund, "Optimal orientation detection of linear symmetry", ICCV 1987.
     """
     height, width = image.shape[2:]
-    image = F.pad(image, (0, -width % _CELL, 0, -height % _CELL), mode="replicate")
+    image = pad_to_multiple(image, _CELL)
     gray = F.pad(image.mean(dim=1, keepdim=True), (2, 2, 2, 2), mode="replicate")
     filters = _SOBEL.to(image)
     # Gradients that need pixels outside the frame would have the direction of the padding.

@@ -29,8 +29,8 @@ from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
-from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.files import decode_flow, encode_flow
+from torchrefract.data.video import read_video, write_video
 
 NAMES = ("a.png", "one/b.png", "one/two/c.bmp")
 TIMES_MS = (0, 40, 80, 600)

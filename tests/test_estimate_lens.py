@@ -8,7 +8,7 @@ from pictures import save_picture
 from torchrefract import LensDistortion
 from torchrefract.cameras.io import read_camera, read_covariance
 from torchrefract.data.images import pixels_of
-from torchrefract.data.media import can_write_videos, write_video
+from torchrefract.data.video import can_write_videos, write_video
 
 BARREL = (-0.16, 0.06)  # relative to the half diagonal
 

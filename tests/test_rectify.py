@@ -11,7 +11,7 @@ from PIL import Image
 
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_opencv, write_kalibr, write_opencv
-from torchrefract.data.media import video_info
+from torchrefract.data.video import video_info
 from torchrefract.fields.rectification import camera_flow
 from torchrefract.warping.grid import inside
 

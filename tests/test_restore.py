@@ -11,8 +11,9 @@ from PIL import Image
 from torchrefract import warp
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli import restoration
+from torchrefract.cli.command import Skipped
 from torchrefract.data.images import pixels_of, read_image
-from torchrefract.data.media import read_video, video_info, write_video
+from torchrefract.data.video import read_video, video_info, write_video
 from torchrefract.fields.rectification import camera_flow
 
 SIZES = {"a.png": (48, 96), "one/b.png": (90, 70), "one/two/b.png": (48, 96), "one/c.bmp": (1, 1)}
@@ -240,18 +241,13 @@ def test_a_video_keeps_its_number_and_rate_of_frames(call, folder, brighter):
 
 
 def test_a_video_that_is_skipped_is_closed_at_once(call, tmp_path, brighter, monkeypatch):
-    """An error that is kept with its traceback keeps frames, open files and the thread that prints the progress."""
+    """An exception that is kept keeps frames, open files and the thread that prints the progress: a text does not."""
     (tmp_path / "raw").mkdir()
     Image.fromarray(smooth_picture(33, 65)).save(tmp_path / "raw" / "a.gif")
-    skip, tracebacks = restoration._skip, list[object]()
-
-    def noted(file, error, failed):
-        skip(file, error, failed)
-        tracebacks.append(failed[file].__traceback__)
-
-    monkeypatch.setattr(restoration, "_skip", noted)
+    all_skipped = list[Skipped]()
+    monkeypatch.setattr(restoration, "Skipped", lambda: all_skipped.append(Skipped()) or all_skipped[-1])
     assert call("restore", f"ckpt_path={brighter}", "input=raw", "out=out").code == 1
-    assert tracebacks == [None]
+    assert [type(error) for skipped in all_skipped for error in skipped.errors] == [str]
 
 
 def test_a_video_with_an_odd_side_is_rejected(call, tmp_path, brighter):

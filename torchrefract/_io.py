@@ -29,6 +29,11 @@ _PACKAGE = Path(__file__).parent
 CONFIG_DIR = str(next((d for d in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if d.is_dir()), _PACKAGE / "conf"))
 
 
+def config_names(group: str) -> list[str]:
+    """Return the names of the configuration files of a group, sorted."""
+    return sorted(path.stem for path in Path(CONFIG_DIR, group).glob("*.yaml"))
+
+
 def as_path(text: str | Path) -> Path:
     """Return the path of a file or folder: of an address such as s3://bucket/folder, one with pathlib's methods.
 

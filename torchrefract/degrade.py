@@ -23,7 +23,7 @@ Examples:
 
 from torchrefract.cli.entry import command
 
-main = command("degrade", __doc__, "degradation:degrade", file="source=my drive (1).mp4")
+main = command("degrade", __doc__, "degradation:degrade")
 
 if __name__ == "__main__":
     main()

@@ -22,7 +22,7 @@ Examples:
 
 from torchrefract.cli.entry import command
 
-main = command("estimate_depth", __doc__, "estimation:estimate_depth", file="source=my drive (1).mp4", has_sweeps=False)
+main = command("estimate_depth", __doc__, "estimation:estimate_depth", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

@@ -14,7 +14,7 @@ Example:
 
 from torchrefract.cli.entry import command
 
-main = command("merge", __doc__, "generation:merge", file="out=my pairs", has_sweeps=False)
+main = command("merge", __doc__, "generation:merge", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

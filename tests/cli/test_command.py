@@ -130,8 +130,8 @@ def test_letters_that_a_redirected_output_lacks_are_escaped(monkeypatch):
     output = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(output, encoding="cp1252", write_through=True))
     monkeypatch.setattr(sys, "argv", ["degrade", "--help"])
-    command("degrade", "folder 路 …", "none:none", file=None)()
-    assert output.getvalue() == b"folder \\u8def \x85\n"
+    command("degrade", "folder 路 …", "none:none")()
+    assert output.getvalue().startswith(b"folder \\u8def \x85\n")
 
 
 def test_a_warning_to_the_user_is_one_line(run_main):
@@ -165,7 +165,7 @@ def test_progress_hands_on_its_items_and_prints_a_line_outside_a_terminal_only_i
     for item in progress(range(2), "working", count=2):
         if item == 1:
             time.sleep(0.2)
-    assert capsys.readouterr().err.startswith("working: 1 of 2, 0 s\n")
+    assert capsys.readouterr().err.startswith("working: 1 of 2, 0 s, about 0 s left\n")
 
 
 # --- arguments

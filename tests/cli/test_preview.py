@@ -16,8 +16,8 @@ from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
 from torchrefract.cli.command import prepare_arguments
 from torchrefract.data.images import fit, pixels_of, read_image
-from torchrefract.data.media import read_video
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.data.video import read_video
 from torchrefract.effects.base import Effect
 from torchrefract.presets import cape_town_fog, limpopo_sun_glare
 from torchrefract.visualization.animation import Animation

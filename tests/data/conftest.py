@@ -72,7 +72,8 @@ def tars(tmp_path_factory, frames) -> Path:
     out.mkdir()
     manifest, storage = Manifest(out, 0, 1), PairStorage(out, 3)
     for i in range(0, len(tasks), 3):
-        manifest.add(storage.write(tasks[i : i + 3], generator))
+        for row in storage.write(tasks[i : i + 3], generator):
+            manifest.add(row)
     return out
 
 

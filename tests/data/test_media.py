@@ -22,17 +22,8 @@ from PIL import ExifTags, Image, ImageCms, ImageOps, PngImagePlugin
 from torchrefract._validation import UsageError
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError, image_header, image_size, read_image
-from torchrefract.data.media import (
-    convert_video,
-    describe_losses,
-    describe_turned,
-    find_media,
-    is_complete,
-    read_video,
-    video_info,
-    write_picture,
-    write_video,
-)
+from torchrefract.data.media import describe_losses, describe_turned, find_media, is_complete, write_picture
+from torchrefract.data.video import convert_video, read_video, video_info, write_video
 
 ONE = 1 << 16  # of the fixed-point numbers of a display matrix
 TURNS = [(a, b, 0, c, d, 0, 0, 0, 1 << 14) for a, b, c, d in (

@@ -16,9 +16,9 @@ from torch.utils.data import DataLoader
 
 from torchrefract._io import as_path
 from torchrefract.data.frames import FrameFolder
-from torchrefract.data.media import write_video
 from torchrefract.data.module import fingerprint
 from torchrefract.data.pairs import PairedFolder
+from torchrefract.data.video import write_video
 
 WORDS = ("scene=paper_refractive", "workers=0")
 NAMES = ("drive0/a [1].png", "drive0/b.png", "drive1/c.png", "d.mp4")

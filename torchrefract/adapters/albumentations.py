@@ -13,7 +13,7 @@ from torchrefract.adapters.config import effect_from_config, effect_to_config
 from torchrefract.effects.base import Effect
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
+from torchrefract.labels.points import in_frame, solve_points
 from torchrefract.types import Degraded
 from torchrefract.warping.implicit import sample_linear
 
@@ -127,7 +127,7 @@ class AlbumentationsEffect(DualTransform):
             return keypoints
         rows = torch.as_tensor(keypoints[:, :_NUM_COLUMNS], dtype=flow.dtype)
         (x, y), angle, scale = rows[:, :2].T, rows[:, 3], rows[:, 4]
-        solution = solve_points(torch.stack([x, y], dim=1)[None], flow[None], STEPS, TOLERANCE_PX)
+        solution = solve_points(torch.stack([x, y], dim=1)[None], flow[None])
         is_hidden = (in_frame(solution.points, flow[None], 0.5) & ~(solution.converged & solution.upright))[0]
         points = torch.where(is_hidden[:, None], -1, solution.points[0])
         # The flow leads from the degraded image to the clean one, so directions turn by the inverse of its Jacobian.

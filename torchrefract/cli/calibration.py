@@ -1,7 +1,6 @@
 """The commands `calibrate`, `rectify` and `make_board`."""
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -42,7 +41,7 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
-from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.command import Skipped, check_none_lost, print_warning, progress
 from torchrefract.cli.options import make, naming, read_option
 from torchrefract.data import media
 from torchrefract.data.images import (
@@ -57,6 +56,7 @@ from torchrefract.data.images import (
 )
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.video import convert_video
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
 from torchrefract.warping.warp import warp
 
@@ -276,6 +276,39 @@ def _print_summary(calibration: Calibration, out: Path) -> None:
     )
 
 
+class _Rectifier:
+    """Rectifies frames of a camera, of any size with the ratio of its sides; keeps a part of them if one is given."""
+
+    def __init__(self, camera: Camera, zoom: float, part: Crop | None):
+        self.camera, self.part = camera, part
+        self.sizes = set[tuple[int, int]]()  # (width, height) of the frames so far
+        self._flow = lru_cache(maxsize=2)(lambda h, w: camera_flow(camera.resized(width=w, height=h), zoom=zoom)[0])
+
+    def write(self, file: Path, path: Path) -> None:
+        """Write the rectified picture or video of a file to a path."""
+        if media.is_video(file):
+            convert_video(file, path, change=lambda frames: map(pixels_of, map(self._rectify, frames)), upright=False)
+        else:
+            frame = read_image(file, upright=False)[None].contiguous()
+            media.write_picture(self._rectify(frame), path, source=file, upright=False)
+
+    def is_complete(self, file: Path, target: Path) -> bool:
+        """Return True if the output of a file is newer, and has the size of the part that is kept."""
+        if self.part is None or media.is_video(file):
+            return media.is_complete(file, target)
+        with suppress(UnreadableImageError):
+            size = self.part.size(image_header(file).size[1], self.camera.width)
+            return not media.is_older(target, file) and image_header(target).size == size
+        return False
+
+    def _rectify(self, frame: Tensor) -> Tensor:
+        """Rectify a frame (1, 3, H, W) in [0, 1] to (3, H, W)."""
+        height, width = frame.shape[2:]
+        result = warp(frame, self._flow(height, width), interpolation="bicubic")[0][0]
+        self.sizes.add((width, height))
+        return result if self.part is None else self.part.of(result, self.camera.width)
+
+
 def rectify(cfg: DictConfig) -> None:
     """Rectify pictures and videos that are not in the output folder yet, and write the camera of the results."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
@@ -287,7 +320,7 @@ def rectify(cfg: DictConfig) -> None:
             zoom = max(zoom, zoom_to_crop(camera))
         _, exists, pinhole = camera_flow(camera, zoom=zoom)
     part, pinhole = _part_to_keep(cfg, camera, covariance, pinhole)
-    files = media.find_media(source)
+    files = media.find_media(source, out=out)
     _claim_for_cameras(out, source, {"lens.yaml": camera, CAMERA_FILE: pinhole})
     if not exists.all():
         share = 1 - exists.double().mean().item()
@@ -295,58 +328,23 @@ def rectify(cfg: DictConfig) -> None:
     for message in filter(None, (media.describe_turned(files), *media.describe_losses(files, upright=False))):
         print_warning(message)
 
-    sizes = set[tuple[int, int]]()
-
-    @lru_cache(maxsize=2)
-    def flow(height: int, width: int) -> Tensor:
-        result = camera_flow(camera.resized(width=width, height=height), zoom=zoom)[0]
-        sizes.add((width, height))
-        return result
-
-    def rectify_frame(frame: Tensor) -> Tensor:
-        """Rectify a frame (1, 3, H, W) in [0, 1] to (3, H, W)."""
-        result = warp(frame, flow(*frame.shape[2:]), interpolation="bicubic")[0][0]
-        return result if part is None else part.of(result, camera.width)
-
-    def is_complete(file: Path, target: Path) -> bool:
-        if part is None or media.is_video(file):
-            return media.is_complete(file, target)
-        with suppress(UnreadableImageError):
-            return not media.is_older(target, file) and (
-                image_header(target).size == part.size(image_header(file).size[1], camera.width)
-            )
-        return False
-
-    def rectify_frames(frames: Iterator[Tensor]) -> Iterator[np.ndarray]:
-        return (pixels_of(rectify_frame(frame)) for frame in frames)
-
-    num_written, failed = 0, dict[Path, ValueError]()
+    rectifier, num_existing, skipped = _Rectifier(camera, zoom, part), 0, Skipped()
     with locked("out", out):
         for file in progress(files, "rectifying", count=len(files)):
             target = out / media.output_name(file).name
             try:
-                if is_complete(file, target):
+                if rectifier.is_complete(file, target):
+                    num_existing += 1
                     continue
                 with replace_file(target, alone=True) as path:
-                    if media.is_video(file):
-                        media.convert_video(file, path, change=rectify_frames, upright=False)
-                    else:
-                        frame = read_image(file, upright=False)[None].contiguous()
-                        media.write_picture(rectify_frame(frame), path, source=file, upright=False)
-                num_written += 1
+                    rectifier.write(file, path)
             except ValueError as error:
-                named = error if isinstance(error, UnreadableImageError) else ValueError(f"{file}: {error}")
-                failed[file] = named.with_traceback(None)  # which would keep frames and open files until the end
-                print(f"skipped: {failed[file]}", file=sys.stderr)
-    if len(failed) == len(files):
-        raise UsageError(f"input must hold a file that can be rectified, got {next(iter(failed.values()))}")
-    num_existing = len(files) - len(failed) - num_written
-    _warn_of_other_sizes(sizes, camera, out / CAMERA_FILE)
-    print(
-        f"{out}: {num_written} rectified, {num_existing} already existed, {len(failed)} skipped; camera of the "
-        f"results: {out}/{CAMERA_FILE}"
-    )
-    check_none_lost([str(error) for error in failed.values() if is_lost(error)])
+                named = f"{error}" if isinstance(error, UnreadableImageError) else f"{file}: {error}"
+                skipped.add(named, is_lost=is_lost(error))
+    counts = skipped.summarize("rectified", total=len(files), existing=num_existing)
+    _warn_of_other_sizes(rectifier.sizes, camera, out / CAMERA_FILE)
+    print(f"{out}: {counts}; camera of the results: {out}/{CAMERA_FILE}")
+    check_none_lost(skipped.lost)
 
 
 def _read_zoom(cfg: DictConfig) -> float:
@@ -377,10 +375,9 @@ def _part_to_keep(
 
 def _claim_for_cameras(out: Path, source: Path, cameras: Mapping[str, Camera]) -> None:
     """Create the output folder with the files of cameras; raise UsageError if it is of another input or camera."""
-    media.check_output_folder(out, source)
     folder = source if source.is_dir() else source.parent
     with naming("out"):
-        claim(out, {"input": str(folder.resolve())}, count=0, about={})
+        claim(out, {"input": str(folder.resolve())})
     for name, camera in cameras.items():
         _write_camera(out / name, camera)
 

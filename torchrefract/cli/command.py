@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -26,7 +27,7 @@ from rich.progress import track
 from torch import nn
 from yaml import YAMLError
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
 from torchrefract.cli.options import FILE_ERRORS
@@ -187,7 +188,7 @@ def require_task(name: str, arguments: list[str]) -> list[str]:
         if argument.startswith("task="):
             raise UsageError(f"{argument} needs a plus, since no task is chosen yet: {example} +{argument}")
     if not any(argument.startswith(_TASK_OPTIONS) for argument in arguments):
-        tasks = sorted(path.stem for path in Path(CONFIG_DIR, "task").glob("*.yaml"))
+        tasks = config_names("task")
         raise UsageError(f"+task must be one of {', '.join(tasks)}: {example} +task={tasks[-1]}, got none")
     return arguments
 
@@ -237,7 +238,9 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
     def report() -> None:
         start = time.monotonic()
         while not finished.wait(_MESSAGE_INTERVAL):
-            print(f"{name}: {done} of {count}, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+            seconds = time.monotonic() - start
+            left = f", about {seconds * (count - done) / done:.0f} s left" if done else ""
+            print(f"{name}: {done} of {count}, {seconds:.0f} s{left}", file=sys.stderr, flush=True)
 
     threading.Thread(target=report, daemon=True).start()
     try:
@@ -246,6 +249,40 @@ def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
             done += 1
     finally:
         finished.set()
+
+
+def batches(items: Iterable[_T], size: int) -> Iterator[list[_T]]:
+    """Yield up to `size` items in a row, as itertools.batched of Python 3.12 does."""
+    rest = iter(items)
+    while batch := list(islice(rest, size)):
+        yield batch
+
+
+class Skipped:
+    """The files or frames of an input that a command skips, by the errors that name them."""
+
+    def __init__(self):
+        self.errors, self.lost = list[str](), list[str]()  # all, and those of files that vanished
+
+    def add(self, error: str, *, is_lost: bool = False) -> None:
+        """Print an error and note it; an exception would keep frames and open files until the end."""
+        print(f"skipped: {error}", file=sys.stderr)
+        self.errors.append(error)
+        self.lost += [error] if is_lost else []
+
+    def summarize(self, verb: str, *, total: int, existing: int, name: str = "input") -> str:
+        """Return how many files were converted; raise UsageError if all were skipped.
+
+        Args:
+            verb: what the command does to a file, as "restored".
+            total: number of files.
+            existing: number of those that were converted before.
+            name: of the option that gives the input.
+        """
+        if len(self.errors) == total:
+            raise UsageError(f"{name} must hold a file that can be {verb}, got {self.errors[0]}")
+        num_made = total - existing - len(self.errors)
+        return f"{num_made} {verb}, {existing} already existed, {len(self.errors)} skipped"
 
 
 def check_none_lost(lost: Sequence[str], *, name: str = "input") -> None:
@@ -353,7 +390,7 @@ def _user_message(error: Exception, name: str) -> str | None:
         return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
     if str(error).startswith("Config group override must be"):  # a ValueError of Hydra
         for group, value in (word.groups() for word in map(_NO_NAME.fullmatch, sys.argv[1:]) if word):
-            if choices := sorted(path.stem for path in Path(CONFIG_DIR, group).glob("*.yaml")):
+            if choices := config_names(group):
                 return f"{group} must be one of {', '.join(choices)}, got {value}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} must be given, as in {error.full_key}=…, got nothing"

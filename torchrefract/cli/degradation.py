@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import sys
 import time
 import warnings
 from collections import Counter
@@ -22,9 +21,8 @@ from torch.utils import _pytree as pytree
 
 from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
-from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.command import Skipped, check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
-    check_memory,
     check_seed,
     depth_folder,
     file_digests,
@@ -55,6 +53,7 @@ from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import FORMATS, count_out_of_range, encode_maps
 from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.video import convert_video
 from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.vehicles import uses_boxes, with_vehicles
@@ -123,17 +122,16 @@ class Degrader(NamedTuple):
 
     def _picture(self, task: _Task, file: Path, path: Path) -> _Result:
         degraded = self._degraded(file, task.name, task.labels)
-        result = _Result(task.name, num_frames=1)
+        num_dropped, annotations = 0, None
         if task.labels:
             content, num_dropped = self._moved(task.file, task.labels, degraded)
-            result = result._replace(num_dropped=num_dropped)
             if isinstance(task.labels, CocoAnnotations):
-                result = result._replace(annotations=content)
+                annotations = content
             else:
                 _write(self.out / "labels" / PurePosixPath(task.name).with_suffix(task.labels.path.suffix), content)
         is_beyond = self._write_maps(degraded, PurePosixPath(task.name).with_suffix(""))
         media.write_picture(degraded.image[0], path, source=file)
-        return result._replace(is_beyond=is_beyond)
+        return _Result(task.name, 1, num_dropped, annotations, is_beyond=is_beyond)
 
     def _degraded(self, file: Path, name: str, labels: PictureLabels | FlowFile | None) -> Degraded:
         image = read_image(file)[None].contiguous()
@@ -186,7 +184,7 @@ class Degrader(NamedTuple):
                 beyond.append(self._write_maps(degraded, PurePosixPath(task.name, f"{t:06d}")))
                 yield pixels_of(degraded.image[0])
 
-        num_frames = media.convert_video(file, path, change=change)
+        num_frames = convert_video(file, path, change=change)
         return _Result(task.name, num_frames=num_frames, is_beyond=any(beyond))
 
     def _effect(self, image: Tensor) -> Effect:
@@ -253,22 +251,20 @@ def degrade(cfg: DictConfig) -> None:
 
 
 def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
-    files = media.find_media(source, deep=True, name="source")
-    media.check_output_folder(out, source, deep=True, name="source")
+    files = media.find_media(source, out=out, deep=True, name="source")
     root = source if source.is_dir() else source.parent
     names = {relative_name(file, root): file for file in files}
     pictures = [name for name, file in names.items() if not media.is_video(file)]
     labels = _labels(cfg, pictures)
     job = _job(cfg, out, root, pictures, labels)
     workers = read_workers(cfg)
-    check_memory(workers, out=out, source=source, **({"depth": job.depth.root} if job.depth else {}))
     if is_remote(out) and isinstance(labels, CocoLabels):
         raise UsageError(
             f"out must lie on this machine for labels of COCO, which a run continues line by line, got {out}; write to "
             "a folder and copy it"
         )
     with naming("out"):
-        claim(out, _settings(cfg, root, job, labels), count=0, about={}, earlier={"files": None, "drives": None})
+        claim(out, _settings(cfg, root, job, labels), earlier={"files": None, "drives": None})
     with locked("out", out):
         finished = {name for name, _ in _read_journal(out)}
         tasks = [
@@ -309,31 +305,28 @@ def _depth_files(task: _Task, depth: DepthFolder | None) -> Iterable[Path]:
 
 def _degrade_missing(missing: Sequence[_Task], job: Degrader, *, workers: int, total: int) -> None:
     start, num_frames, num_dropped = time.perf_counter(), 0, 0
-    failed, beyond = list[_Result](), list[str]()
+    skipped, beyond = Skipped(), list[str]()
     results = map_in_processes(job, missing, workers=workers, preload=__name__) if missing else ()
     for result in progress(results, "degrading", count=len(missing)):
         num_frames, num_dropped = num_frames + result.num_frames, num_dropped + result.num_dropped
         beyond += [result.name] if result.is_beyond else []
         if result.error:
-            failed.append(result)
-            print(f"skipped: {result.error}", file=sys.stderr)
+            skipped.add(result.error, is_lost=result.is_lost)
         elif result.annotations is not None:
             with (job.out / _JOURNAL).open("a", encoding="utf-8") as journal:
                 # The line before may be incomplete, if its run was killed.
                 journal.write("\n" + json.dumps([result.name, result.annotations]))
-    if len(failed) == total:
-        raise UsageError(f"source must hold a file that can be degraded, got {failed[0].error}")
     rate = num_frames / (time.perf_counter() - start)
-    num_degraded, num_existing = len(missing) - len(failed), total - len(missing)
     dropped = f"; {num_dropped} labels left the frame" if any(task.labels for task in missing) else ""
-    print(f"{job.out}: {num_degraded} degraded, {num_existing} already existed, {len(failed)} skipped{dropped}")
+    counts = skipped.summarize("degraded", total=total, existing=total - len(missing), name="source")
+    print(f"{job.out}: {counts}{dropped}")
     print(f"{num_frames} frames, {rate:.3g} frames a second")
     if beyond:
         print_warning(
             f"the flows of {first_names(sorted(beyond))} exceed 512 px, the range of a PNG, where they are clipped and "
             "marked as not valid; maps=npz or safetensors holds them"
         )
-    check_none_lost([result.error for result in failed if result.is_lost], name="source")
+    check_none_lost(skipped.lost, name="source")
 
 
 def _labels(cfg: DictConfig, pictures: Sequence[str]) -> _Labels | None:

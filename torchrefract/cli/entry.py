@@ -10,7 +10,7 @@ from collections.abc import Callable
 _HELP = ("--help", "-h")
 _HYDRA = (
     "Options of Hydra: `--cfg job` prints all options with their values{sweeps}. A file name may hold any letters; "
-    "only the shell needs quotes, as in `'{file}'`."
+    "only the shell needs quotes, as in `'OPTION=my drive (1).mp4'`."
 )
 _SWEEPS = ", `-m` runs each combination of values such as `seed=1,2`"
 # Their libraries are in the extra "calibration".
@@ -18,21 +18,13 @@ _CAMERA_COMMANDS = ("calibrate", "rectify", "make_board", "estimate_lens")
 _EXTRAS = {"onnx": "export", "ray": "ray"}  # by the first letters of a library; that of all others is "train"
 
 
-def command(
-    name: str,
-    page: str | None,
-    function: str,
-    *,
-    file: str | None = "input=my drive (1).mp4",
-    has_sweeps: bool = True,
-) -> Callable[[], None]:
+def command(name: str, page: str | None, function: str, *, has_sweeps: bool = True) -> Callable[[], None]:
     """Return the main function of `python -m torchrefract.<name>`.
 
     Args:
         name: of the module, and of its file in conf.
         page: the help page, which `--help` prints with the options of Hydra below.
         function: as "module:name", with the module in torchrefract.cli. It is called with the configuration.
-        file: an option with a file, as an example of its quotes; None for a page that has the options of Hydra.
         has_sweeps: True for a command that the option `-m` runs for several values.
     """
 
@@ -41,8 +33,8 @@ def command(
         if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
             sys.stdout.reconfigure(errors="backslashreplace")
         if any(argument in _HELP for argument in sys.argv[1:]):
-            options = _HYDRA.format(sweeps=_SWEEPS if has_sweeps else "", file=file)
-            print("\n\n".join([(page or "").strip(), *([textwrap.fill(options, 120)] if file else [])]))
+            options = _HYDRA.format(sweeps=_SWEEPS if has_sweeps else "")
+            print(f"{(page or '').strip()}\n\n{textwrap.fill(options, 120)}")
             return
         module, _, attribute = function.partition(":")
         try:

@@ -1,9 +1,8 @@
 """The commands that estimate the depth of pictures and videos, and the lens of the camera of a drive."""
 
 import statistics
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import accumulate, count
+from itertools import accumulate, count, groupby
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -17,14 +16,15 @@ from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.command import print_warning, progress
+from torchrefract.cli.command import Skipped, batches, print_warning, progress
 from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.configuration import claim
+from torchrefract.data.pairs.configuration import CONFIG, claim
 from torchrefract.data.pairs.manifest import locked
+from torchrefract.data.video import read_video, video_info
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 from torchrefract.warping.flow import resize_image
 
@@ -45,8 +45,7 @@ def estimate_depth(cfg: DictConfig) -> None:
 
 def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     size = read_option(cfg, "batch", check_count)
-    files = media.find_media(source, deep=True, name="source")
-    media.check_output_folder(out, source, deep=True, name="source")
+    files = media.find_media(source, out=out, deep=True, name="source")
     folder, root = DepthFolder(out), source if source.is_dir() else source.parent
     pictures = [relative_name(file, root) for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
@@ -58,17 +57,17 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     if not isinstance(network, TransformersDepth):
         raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
     with naming("out"):
-        if (out / "config.json").is_file():
+        if (out / CONFIG).is_file():
             _claim(cfg, out, root)
         make_folder(out)
-    skipped, spreads = dict[str, str](), list[float]()
+    skipped, spreads = Skipped(), list[float]()
     num_written = 0
     with locked("out", out):
         frames = _missing_frames(progress(files, "estimating depth", count=len(files)), root, folder, skipped)
         for batch in _batches(frames, size):
             for frame, result in zip(batch, network.each(torch.stack([frame.image for frame in batch])), strict=True):
                 if isinstance(result, RoadSpreadError):
-                    _skip(skipped, frame.name, f"{frame.name}: {result}")
+                    skipped.add(f"{frame.name}: {result}")
                     continue
                 if num_written == 0:
                     _claim(cfg, out, root)
@@ -76,30 +75,28 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
                 write_depth(frame.target, result.depth[0].cpu())
                 num_written += 1
                 spreads += [] if result.spread is None else [result.spread]
-    if num_written == 0 and skipped:
-        raise UsageError(f"source must hold a frame whose depth can be estimated, got {next(iter(skipped.values()))}")
+    if num_written == 0 and skipped.errors:
+        raise UsageError(f"source must hold a frame whose depth can be estimated, got {skipped.errors[0]}")
     spread = f", median spread of the scale {statistics.median(spreads):.2f}" if spreads else ""
-    print(f"{out}: {num_written} depth maps written, {len(skipped)} frames skipped{spread}")
-    if skipped:
+    print(f"{out}: {num_written} depth maps written, {len(skipped.errors)} frames skipped{spread}")
+    if skipped.errors:
         raise SystemExit(1)
 
 
 def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
     """Note the settings in the output folder; raise UsageError if its maps are of another network, road or source."""
     names = [path.name for path in matching_files(out, "*") if not path.name.startswith(".")]
-    if names and "config.json" not in names:
+    if names and CONFIG not in names:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
     content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
-    claim(out, {"source": str(root.resolve()), "model": content}, count=0, about={})
+    claim(out, {"source": str(root.resolve()), "model": content})
 
 
-def _missing_frames(
-    files: Iterable[Path], root: Path, folder: DepthFolder, skipped: dict[str, str]
-) -> Iterator[_Frame]:
+def _missing_frames(files: Iterable[Path], root: Path, folder: DepthFolder, skipped: Skipped) -> Iterator[_Frame]:
     """Yield the frames that have no map yet, or changed since; name those that cannot be read."""
     # Maps of another program may be older than copies of its frames.
-    is_claimed = not is_remote(folder.root) and (folder.root / "config.json").is_file()
+    is_claimed = not is_remote(folder.root) and (folder.root / CONFIG).is_file()
 
     def has_map(file: Path, name: str, index: int | None = None) -> bool:
         return folder.has(name, index) and not (is_claimed and media.is_older(folder.path(name, index), file))
@@ -108,30 +105,19 @@ def _missing_frames(
         name = relative_name(file, root)
         try:
             if media.is_video(file):
-                for index, image in media.read_video(file, count()):
+                for index, image in read_video(file, count()):
                     if not has_map(file, name, index):
                         yield _Frame(image[0], folder.path(name, index), f"{name}#{index}")
             elif not has_map(file, name):
                 yield _Frame(read_image(file), folder.path(name), name)
         except UnreadableImageError as error:
-            _skip(skipped, name, str(error))
-
-
-def _skip(skipped: dict[str, str], name: str, reason: str) -> None:
-    skipped[name] = reason
-    print(f"skipped: {reason}", file=sys.stderr)
+            skipped.add(str(error))
 
 
 def _batches(frames: Iterator[_Frame], size: int) -> Iterator[list[_Frame]]:
     """Yield up to `size` frames in a row of one shape."""
-    batch = list[_Frame]()
-    for frame in frames:
-        if batch and (len(batch) == size or frame.image.shape != batch[0].image.shape):
-            yield batch
-            batch = []
-        batch.append(frame)
-    if batch:
-        yield batch
+    for _, group in groupby(frames, lambda frame: frame.image.shape):
+        yield from batches(group, size)
 
 
 def estimate_lens(cfg: DictConfig) -> None:
@@ -202,7 +188,7 @@ def flow_predictor(model: Callable[[Tensor], Any], size: tuple[int, int], device
 def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, list[int]]]:
     """Choose at most so many frames, evenly spaced over all files; return their numbers in each file."""
     # A video that states no frames is read too, which says why it has none.
-    counts = [max(1, media.video_info(file)[0]) if media.is_video(file) else 1 for file in files]
+    counts = [max(1, video_info(file)[0]) if media.is_video(file) else 1 for file in files]
     numbers, chosen = evenly_spaced(sum(counts), max_frames), list[tuple[Path, list[int]]]()
     for file, start, end in zip(files, accumulate([0, *counts]), accumulate(counts), strict=False):
         chosen.append((file, [number - start for number in numbers if start <= number < end]))
@@ -211,12 +197,12 @@ def _select_frames(files: Sequence[Path], max_frames: int) -> list[tuple[Path, l
 
 def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> Iterator[Tensor]:
     """Yield frames (1, 3, H, W) as stored, or as a viewer shows them; name and skip unreadable files."""
-    num_read, reason, size = 0, "", None
+    num_read, skipped, size = 0, Skipped(), None
     for file, times in chosen:
         num_before = num_read
         try:
             if media.is_video(file):
-                frames = (frame for _, frame in media.read_video(file, times, upright=upright))
+                frames = (frame for _, frame in read_video(file, times, upright=upright))
             else:
                 frames = (read_image(file, upright=upright)[None] for _ in times)
             for frame in frames:
@@ -232,10 +218,9 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             if times and num_read == num_before:
                 raise UnreadableImageError(f"{file} is not a video with a frame that can be decoded")
         except UnreadableImageError as error:
-            reason = str(error)
-            print(f"skipped: {reason}", file=sys.stderr)
+            skipped.add(str(error))
     if num_read == 0:
-        raise UnreadableImageError(f"input must hold a readable picture or video, got {reason}")
+        raise UnreadableImageError(f"input must hold a readable picture or video, got {skipped.errors[-1]}")
 
 
 def _load_network(cfg: DictConfig) -> Predictor:

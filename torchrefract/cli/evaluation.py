@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract.cameras.camera import Camera
 from torchrefract.data.module import PairData, fingerprint
 from torchrefract.data.pairs.configuration import flatten
@@ -60,8 +60,7 @@ def use_validation_config(
         CheckpointError: the configuration of the checkpoint could run code of another package.
     """
     OmegaConf.resolve(cfg)
-    stored = checkpoint.get("config")
-    if not (isinstance(stored, dict) and all(isinstance(stored.get(part), dict) for part in ("data", "model"))):
+    if (stored := _stored_config(checkpoint)) is None:
         return None
     keys = [override.lstrip("+~").partition("=")[0] for override in overrides]
     if "experiment" not in keys:
@@ -87,8 +86,7 @@ def use_validation_config(
 
 def changed_values(cfg: DictConfig, checkpoint: dict[str, Any], *, ignored: Sequence[str] = _NOT_COMPARED) -> list[str]:
     """Return the names of the values of data and model that differ from those of a checkpoint's configuration."""
-    stored = checkpoint.get("config")
-    if not (isinstance(stored, dict) and all(isinstance(stored.get(part), dict) for part in ("data", "model"))):
+    if (stored := _stored_config(checkpoint)) is None:
         return []
     before, after = (_compared(config, ignored) for config in (stored, cast(Any, OmegaConf.to_container(cfg))))
     return sorted(key for key in before.keys() | after.keys() if before.get(key) != after.get(key))
@@ -108,10 +106,17 @@ def describe_validation(data: PairData, cfg: DictConfig, changed: list[str] | No
     )
 
 
+def _stored_config(checkpoint: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the configuration in a checkpoint; None if it does not hold that of the data and the model."""
+    config = checkpoint.get("config")
+    is_usable = isinstance(config, dict) and all(isinstance(config.get(part), dict) for part in ("data", "model"))
+    return config if is_usable else None
+
+
 def _choice(group: str, config: Any) -> str | None:
     """Return the file in a group of conf that makes a part of a configuration, or None."""
-    files = sorted(Path(CONFIG_DIR, group).glob("*.yaml"))
-    return next((file.stem for file in files if _kind(OmegaConf.load(file)) == _kind(config)), None)
+    kinds = {name: _kind(OmegaConf.load(Path(CONFIG_DIR, group, f"{name}.yaml"))) for name in config_names(group)}
+    return next((name for name, kind in kinds.items() if kind == _kind(config)), None)
 
 
 def _kind(config: Any) -> tuple[Any, Any] | None:

@@ -1,27 +1,23 @@
 """The commands `generate`, which writes pairs to disk, and `merge`, which joins the manifests of its shards."""
 
-import json
 import os
 import shutil
-import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils import _pytree as pytree
 
 import torchrefract
-from torchrefract._io import as_path, is_remote, make_folder, read_bytes, remove_file
+from torchrefract._io import as_path, is_remote, make_folder, remove_file
 from torchrefract._validation import (
     UsageError,
     check_choice,
@@ -31,9 +27,8 @@ from torchrefract._validation import (
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, print_warning, warn_of_assumed_depth
+from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
-    check_memory,
     check_seed,
     depth_folder,
     disk_errors,
@@ -50,7 +45,7 @@ from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.card import summarize, write_card
-from torchrefract.data.pairs.configuration import check_shards, claim, shard_configs, shard_suffix
+from torchrefract.data.pairs.configuration import CONFIG, check_shards, claim, read_config, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -73,15 +68,12 @@ from torchrefract.data.pairs.ray_engine import check_cluster
 from torchrefract.data.pairs.sources import LIST, Sources, find_sources, read_sources
 from torchrefract.data.workers import map_in_processes
 
-_T = TypeVar("_T")
-
 _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the manifest state all
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _TAGS = 16  # frames whose orientation is read beside a camera
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
 _VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
 _VERSIONS |= {"numpy": np.__version__, "opencv": cv2.__version__}
-_MESSAGE_INTERVAL = 60.0  # seconds
 
 
 class Shard(NamedTuple):
@@ -159,13 +151,14 @@ def _make_missing(options: Options, out: Path) -> tuple[int, list[str]]:
         _check_disk(options, [number for unit in units for number in unit], storage)
         tasks = ([options.task(number) for number in unit] for unit in units)
         workers = min(options.workers, len(units))
-        rows = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
+        made = generate_pairs(tasks, options.generator, storage, workers=workers, engine=options.engine)
         try:
-            for unit in _with_progress(rows, total=sum(map(len, units))):
-                lost += [row.skipped.removeprefix(LOST) for row in unit if row.skipped.startswith(LOST)]
-                readable = [row for row in unit if not row.skipped.startswith(LOST)]
-                manifest.add(readable)
-                num_made += sum(not row.skipped for row in readable)
+            for row in progress(chain.from_iterable(made), "making pairs", count=sum(map(len, units))):
+                if row.skipped.startswith(LOST):
+                    lost.append(row.skipped.removeprefix(LOST))
+                else:
+                    manifest.add(row)
+                    num_made += not row.skipped
         finally:
             manifest.flush()
     manifest.close()
@@ -208,7 +201,6 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     if engine["name"] == "ray" and engine["address"]:
         check_cluster(str(engine["address"]))
     source = read_path(cfg, "source")
-    check_memory(workers, out=out, source=source)
     if is_remote(out) == is_remote(source) and out.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"out must lie outside of source, so that pairs do not become sources, got {cfg.out}")
     if not str(cfg.license or "").strip():
@@ -223,7 +215,6 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         if turned := describe_turned([*paths.values()], upright=True):
             print_warning(turned)
     if (depth := depth_folder(cfg)) is not None:
-        check_memory(workers, depth=depth.root)
         plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
@@ -326,27 +317,6 @@ def _check_disk(options: Options, missing: Sequence[int], storage: PairStorage) 
     print(estimate, flush=True)
 
 
-def _with_progress(units: Iterable[list[PairRow]], *, total: int) -> Iterator[list[PairRow]]:
-    """Yield units of pairs; show progress in a terminal, and print a line a minute elsewhere."""
-    console = Console(stderr=True)
-    start = printed = time.monotonic()
-    done = 0
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("pairs, {task.fields[rate]}"), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, rate="")
-        for unit in units:
-            yield unit
-            done += len(unit)
-            now = time.monotonic()
-            rate = done / max(now - start, 1e-9)
-            bar.update(task, completed=done, rate=f"{rate:.3g} a second")
-            if now - printed > _MESSAGE_INTERVAL and not console.is_terminal:
-                printed, minutes = now, (total - done) / rate / 60
-                print(
-                    f"{done} of {total} pairs, {rate:.3g} a second, {minutes:.0f} min left", file=sys.stderr, flush=True
-                )
-
-
 def _finish(options: Options, out: Path, *, num_made: int) -> None:
     """Write the card if all shards have finished, and print the last line."""
     rows = scan_rows(find_manifests(out), lambda row: row.number < options.num_pairs, skip_invalid=True)
@@ -405,11 +375,11 @@ def merge(cfg: DictConfig) -> None:
 def _configuration(out: Path) -> tuple[dict[str, Any], int, str]:
     """Return the settings, the number of pairs and the license in config.json."""
     try:
-        document = json.loads(read_bytes(out / "config.json"))
-        settings = document["settings"]
+        config = read_config(out / CONFIG)
+        settings = config["settings"]
         _ = settings["scene"]["name"], settings["seed"]  # an error if there is none
-        return settings, int(document["count"]), str(document["license"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return settings, int(config["count"]), str(config["license"])
+    except (OSError, UsageError, KeyError, TypeError) as error:
         raise UsageError(f"out must be a folder of generate with a valid config.json, got {out}") from error
 
 

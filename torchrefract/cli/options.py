@@ -19,9 +19,7 @@ from torchrefract._validation import UsageError, check_count, check_number, chec
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import FrameFolder
-from torchrefract.data.images import UnreadableImageError, center_crop, check_frame_of_camera, image_size
-from torchrefract.data.media import describe_turned
+from torchrefract.data.images import UnreadableImageError, center_crop
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.workers import num_cores
 from torchrefract.effects.base import Effect
@@ -66,9 +64,19 @@ def read_optional(cfg: DictConfig, name: str, check: Callable[..., _T], **limits
 
 
 def read_workers(cfg: DictConfig) -> int:
-    """Return the number of processes; null is one for each core."""
+    """Return the number of processes; null is one for each core.
+
+    Raises:
+        UsageError: processes would share a path in memory://.
+    """
     workers = read_optional(cfg, "workers", check_count, low=0)
-    return num_cores() if workers is None else workers
+    workers = num_cores() if workers is None else workers
+    for name in ("out", "source", "depth"):
+        if workers and str(cfg[name]).startswith("memory://"):
+            raise UsageError(
+                f"workers must be 0 for {name}={cfg[name]}, because each process has its memory, got {workers}"
+            )
+    return workers
 
 
 def read_path(cfg: DictConfig, name: str) -> Path:
@@ -184,31 +192,12 @@ def place_scene(cfg: DictConfig, *, size: Sequence[int] | None = None) -> Camera
     return camera
 
 
-def check_drives(camera: Camera, frames: FrameFolder) -> str:
-    """Describe turned frames among the first of each drive; raise UsageError if one has another shape than the camera.
-
-    A drive has one camera.
-    """
-    first = [*dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values()]
-    for frame in first:
-        height, width = image_size(frame)
-        check_frame_of_camera(camera, str(frame), height=height, width=width)
-    return describe_turned(first, upright=True)
-
-
 @contextmanager
 def source_and_out(cfg: DictConfig) -> Iterator[tuple[Path, Path]]:
     """Yield the paths or addresses of the options `source` and `out`; errors of a store for `out` become one line."""
     source, out = read_path(cfg, "source"), read_path(cfg, "out")
     with disk_errors(out) if is_remote(out) else nullcontext():
         yield source, out
-
-
-def check_memory(workers: int, **paths: Path) -> None:
-    """Raise UsageError if processes would share a path in memory://, by the name of its option."""
-    for name, path in paths.items():
-        if workers and "memory" in getattr(path, "protocol", ""):
-            raise UsageError(f"workers must be 0 for {name}={path}, because each process has its memory, got {workers}")
 
 
 @contextmanager
@@ -227,6 +216,3 @@ def disk_errors(out: Path) -> Iterator[None]:
         raise UsageError(
             f"out must be a folder that can be written to, got {out} ({error.strerror or error})"
         ) from error
-    except KeyboardInterrupt:
-        print("stopped; the same command continues")
-        raise SystemExit(130) from None

@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from torchrefract._io import CONFIG_DIR
+from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract.adapters.config import config_to_code, effect_to_config, without_defaults
 from torchrefract.data.images import UnreadableImageError, fit, pixels_of, read_image
 from torchrefract.data.road_scenes import render_road_scenes
@@ -83,8 +83,7 @@ class View(NamedTuple):
 
 def choices() -> list[str]:
     """Return the names of scenes, and then of effects."""
-    scenes = sorted(path.stem for path in Path(CONFIG_DIR, "scene").glob("*.yaml"))
-    return scenes + list(_effects())
+    return config_names("scene") + list(_effects())
 
 
 def is_scene(choice: str) -> bool:

@@ -17,8 +17,9 @@ from torchrefract.cli.command import print_warning, progress, warn_of_assumed_de
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
 from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
 from torchrefract.data.images import EXTENSIONS, files_in, fit, natural_order, read_image
-from torchrefract.data.media import VIDEOS, describe_turned, read_video
+from torchrefract.data.media import VIDEOS, describe_turned
 from torchrefract.data.road_scenes import render_road_scenes
+from torchrefract.data.video import read_video
 from torchrefract.effects.base import Effect
 from torchrefract.visualization.animation import (
     FrameSequence,

@@ -3,15 +3,13 @@
 import math
 import os
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,11 +22,10 @@ from torch import Tensor
 from torchrefract._io import as_path, file_digest, make_folder, matching_files, remove_file, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import check_none_lost, print_warning, progress
+from torchrefract.cli.command import Skipped, batches, check_none_lost, print_warning, progress
 from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
-    check_drives,
     check_seed,
     check_task_options,
     find_device,
@@ -42,25 +39,26 @@ from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
     UnreadableImageError,
+    check_frame_of_camera,
+    image_size,
     is_lost,
     pixels_of,
     read_image,
 )
 from torchrefract.data.media import (
-    check_output_folder,
-    convert_video,
     describe_losses,
+    describe_turned,
     find_media,
     is_complete,
     is_video,
     output_name,
-    video_info,
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
 from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
+from torchrefract.data.video import convert_video, video_info
 from torchrefract.data.workers import num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
@@ -80,7 +78,6 @@ from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint,
 from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.warping.warp import INTERPOLATIONS
 
-_T = TypeVar("_T")
 _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the start of processes
 
 
@@ -146,8 +143,6 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
 
 def evaluate(cfg: DictConfig) -> None:
     """Score a checkpoint, by default on the data that it was validated on."""
-    if cfg.ckpt_path is None:
-        raise UsageError("ckpt_path must be the path of a checkpoint: add ckpt_path=<run>/best.ckpt, got none")
     path = find_checkpoint(str(cfg.ckpt_path))
     checkpoint = read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
     changed = use_validation_config(cfg, checkpoint, list(HydraConfig.get().overrides.task), path)
@@ -161,13 +156,12 @@ def evaluate(cfg: DictConfig) -> None:
 def restore(cfg: DictConfig) -> None:
     """Restore all pictures and videos of a folder that are not restored yet; print their number and the rate."""
     source, out = Path(str(cfg.input)), Path(str(cfg.out))
-    files = find_media(source, deep=True)
-    check_output_folder(out, source, deep=True)
+    files = find_media(source, out=out, deep=True)
     job = _make_job(cfg, source if source.is_dir() else source.parent, out)
     if job.deviation:
         _check_maps(files, job)
     with naming("out"):
-        claim(out, _settings(cfg, job), count=0, about={})
+        claim(out, _settings(cfg, job))
     with locked("out", out):
         if cfg.pool == "lens":
             job = job.with_one_lens(files, out / "camera.yaml")
@@ -179,18 +173,16 @@ def _restore_missing(files: Sequence[Path], job: "_Job") -> None:
     for loss in describe_losses(todo, upright=True):
         print_warning(loss)
     start = time.perf_counter()
-    failed = dict[Path, UnreadableImageError]()
-    num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, failed)
-    num_frames += sum(_restore_video(file, job, failed) for file in todo if is_video(file))
-    if len(failed) == len(files):
-        raise UsageError(f"input must hold a file that can be restored, got {next(iter(failed.values()))}")
+    skipped = Skipped()
+    num_frames = _restore_pictures([file for file in todo if not is_video(file)], job, skipped)
+    num_frames += sum(_restore_video(file, job, skipped) for file in todo if is_video(file))
     rate = num_frames / (time.perf_counter() - start)
-    num_restored, num_existing = len(todo) - len(failed), len(files) - len(todo)
-    print(f"{job.out}: {num_restored} restored, {num_existing} already existed, {len(failed)} skipped")
+    counts = skipped.summarize("restored", total=len(files), existing=len(files) - len(todo))
+    print(f"{job.out}: {counts}")
     if deviations := job.restorer.deviations:
         print(f"standard deviation of the flow: {median(deviations):.1f} px, root mean square, median of the frames")
     print(f"{num_frames} frames, {rate:.3g} frames a second on {job.device}")
-    check_none_lost([str(error) for error in failed.values() if is_lost(error)])
+    check_none_lost(skipped.lost)
 
 
 def export(cfg: DictConfig) -> None:
@@ -265,10 +257,14 @@ def _place_scene(cfg: DictConfig) -> Camera | None:
 
 
 def _check_camera(camera: Camera, data: PairData) -> None:
-    """Check the camera of the frames as `check_drives` does, and warn of frames that a tag turns."""
+    """Raise UsageError if the first frame of a drive has another shape than the camera; warn if a tag turns it."""
     for frames in (data.train, data.val):
         assert isinstance(frames, FrameFolder)  # as `_place_scene` checked
-        if turned := check_drives(camera, frames):
+        first = [*dict(zip(reversed(frames.drive_names), reversed(frames.paths), strict=True)).values()]
+        for frame in first:
+            height, width = image_size(frame)
+            check_frame_of_camera(camera, str(frame), height=height, width=width)
+        if turned := describe_turned(first, upright=True):
             print_warning(turned)
 
 
@@ -390,16 +386,16 @@ def _settings(cfg: DictConfig, job: _Job) -> dict[str, Any]:
     }
 
 
-def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, UnreadableImageError]) -> int:
-    """Restore pictures, note the unreadable ones in `failed`, and return the number restored."""
+def _restore_pictures(files: Sequence[Path], job: _Job, skipped: Skipped) -> int:
+    """Restore pictures and return their number, without the unreadable ones."""
     count = 0
-    for chunk in _batches(progress(files, "restoring", count=len(files)), job.batch):
+    for chunk in batches(progress(files, "restoring", count=len(files)), job.batch):
         images = dict[Path, Tensor]()
         for file in chunk:
             try:
                 images[file] = read_image(file)
             except UnreadableImageError as error:
-                _skip(file, error, failed)
+                skipped.add(str(error), is_lost=is_lost(error))
         restored = job.restore([*images.values()]) if images else ()
         for file, (image, deviation) in zip(images, restored, strict=True):
             target = job.target(file)
@@ -411,16 +407,16 @@ def _restore_pictures(files: Sequence[Path], job: _Job, failed: dict[Path, Unrea
                     write_map(job.map_target(file), deviation)
                 count += 1
             except UnreadableImageError as error:  # the file vanished after it was read
-                _skip(file, error, failed)
+                skipped.add(str(error), is_lost=is_lost(error))
     return count
 
 
-def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageError]) -> int:
-    """Restore a video and return the number of its frames; note an unreadable one in `failed` and return 0."""
+def _restore_video(file: Path, job: _Job, skipped: Skipped) -> int:
+    """Restore a video and return the number of its frames; 0 for an unreadable one."""
 
     def change(frames: Iterable[Tensor]) -> Iterator[np.ndarray]:
         num_frames = video_info(file)[0]
-        for chunk in _batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
+        for chunk in batches(progress(frames, f"restoring {file.name}", count=num_frames), job.batch):
             yield from (pixels_of(image) for image, _ in job.restore([frame[0] for frame in chunk]))
 
     target = job.target(file)
@@ -431,19 +427,8 @@ def _restore_video(file: Path, job: _Job, failed: dict[Path, UnreadableImageErro
         with replace_file(target, alone=True) as path:
             return convert_video(file, path, change=change)
     except UnreadableImageError as error:
-        _skip(file, error, failed)
+        skipped.add(str(error), is_lost=is_lost(error))
         return 0
-
-
-def _skip(file: Path, error: UnreadableImageError, failed: dict[Path, UnreadableImageError]) -> None:
-    failed[file] = error.with_traceback(None)  # which would keep frames and open files until the end
-    print(f"skipped: {error}", file=sys.stderr)
-
-
-def _batches(items: Iterable[_T], size: int) -> Iterator[list[_T]]:
-    rest = iter(items)
-    while batch := list(islice(rest, size)):
-        yield batch
 
 
 def _parse_size(text: str) -> tuple[int, int]:

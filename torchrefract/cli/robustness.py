@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
@@ -22,7 +21,7 @@ import torchrefract
 from torchrefract import random
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, first_names
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
+from torchrefract.cli.command import Skipped, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_seed,
     depth_folder,
@@ -54,7 +53,6 @@ from torchrefract.data.label_files import (
     PictureLabels,
     YoloFile,
     boxes_of_coco,
-    boxes_of_yolo,
     read_labels,
 )
 from torchrefract.data.media import describe_turned
@@ -87,7 +85,7 @@ class _Folder(NamedTuple):
     names: list[str]
     labels: CocoLabels | LabelFolder | None
     depths: DepthFolder | None
-    skipped: list[str]  # why pictures cannot be read
+    skipped: Skipped
     classes: set[int]  # the lowest and highest class of the masks that were read, and the ignored one if they hold it
     place: dict[str, Any]  # arguments of the scenes
     device: torch.device  # of the images, and so of the effects
@@ -110,8 +108,7 @@ class _Folder(NamedTuple):
             try:
                 image = read_image(self.path / name)
             except UnreadableImageError as error:
-                self.skipped.append(str(error))
-                print(f"skipped: {error}", file=sys.stderr)
+                self.skipped.add(str(error))
                 continue
             check_frame_of_camera(self.camera, name, height=image.shape[1], width=image.shape[2])
             with naming("labels"):
@@ -159,24 +156,17 @@ def test_robustness(cfg: DictConfig) -> None:
     ):
         for message in _SAID_ELSEWHERE:
             warnings.filterwarnings("ignore", message)  # the command prints it once
-        names = progress(folder.names, "scoring", count=len(folder.names))
         options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "depth": folder.depth, "done": done}
         options |= {"on_scored": store, "worst_case_draws": num_draws, "batch_size": batch_size}
-        try:
-            result = evaluate(predict, folder.read(names), scenes, score, **options)
-        except RuntimeError as error:
-            if len(folder.skipped) == len(folder.names):
-                raise UsageError(f"data must hold a picture that can be read, got {folder.skipped[0]}") from error
-            raise UsageError(f"model: {error}") from error
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        result = _score(folder, predict, scenes, score, options)
         _check_clean(result, folder)
         about = settings | {
             "metric": _metric(cfg, out / SCORES),
             "torchrefract": torchrefract.__version__,
             "torch": torch.__version__,
         }
-        comparison = base and _compare(result, base, str(cfg.base))
+        with naming("base"):
+            comparison = base and compare_with_base(result, base[1], folder=str(cfg.base), model=base[0])
         write_tables(result, out, about, loss=loss, comparison=comparison)
         examples = [
             _example(name, level, result, folder, predict, scenes, seed) for name, level in _worst(result, num_worst)
@@ -191,9 +181,17 @@ def test_robustness(cfg: DictConfig) -> None:
     _print_failures(result)
 
 
-def _compare(result: Robustness, base: tuple[str, Robustness], folder: str) -> BaseComparison:
-    with naming("base"):
-        return compare_with_base(result, base[1], folder=folder, model=base[0])
+def _score(folder: _Folder, predict: Predict, scenes: Any, score: Any, options: dict[str, Any]) -> Robustness:
+    """Score the pictures of a folder by `evaluate`; its errors become UsageError."""
+    names = progress(folder.names, "scoring", count=len(folder.names))
+    try:
+        return evaluate(predict, folder.read(names), scenes, score, **options)
+    except RuntimeError as error:
+        if len(errors := folder.skipped.errors) == len(folder.names):
+            raise UsageError(f"data must hold a picture that can be read, got {errors[0]}") from error
+        raise UsageError(f"model: {error}") from error
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _print_comparison(comparison: BaseComparison | None, *, has_labels: bool) -> None:
@@ -287,20 +285,20 @@ def _folder(cfg: DictConfig) -> _Folder:
     place = read_place(cfg)
     if (labels or "camera" in place) and (turned := describe_turned([path / name for name in names], upright=True)):
         print_warning(turned)
-    return _Folder(path, names, labels, depths, [], set(), place, find_device(str(cfg.device)))
+    return _Folder(path, names, labels, depths, Skipped(), set(), place, find_device(str(cfg.device)))
 
 
 def _target(labels: PictureLabels | None, image: Tensor) -> Any:
     """Return the labels of a picture (3, H, W) as torchvision's types; without a YOLO file it holds nothing."""
     size = (image.shape[1], image.shape[2])
-    content: Any = [] if labels is None else labels.move(None, size).content  # raises for labels of another size
+    boxes, classes = np.zeros((0, 4)), []
     if isinstance(labels, MaskFile):
-        with Image.open(io.BytesIO(content)) as picture:
+        with Image.open(io.BytesIO(labels.move(None, size).content)) as picture:  # raises for a mask of another size
             return tv_tensors.Mask(np.array(picture).astype(np.int32))
     if isinstance(labels, YoloFile):
-        boxes, classes = boxes_of_yolo(content, labels, size)
-    else:
-        annotations = [annotation for annotation in content if not annotation.get("iscrowd")]
+        boxes, classes = labels.boxes(size)
+    elif labels is not None:
+        annotations = [a for a in labels.move(None, size).content if not a.get("iscrowd")]
         for annotation in annotations:
             if not annotation.get("bbox") or not isinstance(annotation.get("category_id"), int):
                 raise ValueError(

@@ -1,5 +1,6 @@
 """Depth maps of frames in files: gray PNGs of 16 bits, or .npy arrays in m."""
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._io import is_remote, local_file, relative_name, sizes_in_store, write_file
+from torchrefract._io import is_remote, read_bytes, relative_name, sizes_in_store, write_file
 from torchrefract._validation import UsageError
-from torchrefract.data.images import fit, image_size, local_copy
+from torchrefract.data.images import fit, read_file, read_header
 from torchrefract.fields.depth import check_depth
 
 STEP = 1 / 256  # of a level of a PNG: m, or px of a deviation
@@ -161,9 +162,9 @@ def crop_depth(depth: Tensor, frame_size: tuple[int, int], size: tuple[int, int]
 
 
 def _read_png(path: Path) -> np.ndarray:
-    with local_copy(path) as copy:
-        image_size(copy)  # raises UnreadableImageError
-        steps = cv2.imdecode(np.fromfile(copy, np.uint8), cv2.IMREAD_UNCHANGED)
+    data = read_file(path)
+    read_header(path, io.BytesIO(data))  # raises UnreadableImageError
+    steps = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if steps is None or steps.dtype != np.uint16 or steps.ndim != 2:
         raise UsageError(f"depth must be a gray PNG of 16 bits, or a .npy in m, got {path}")
     return steps
@@ -171,8 +172,7 @@ def _read_png(path: Path) -> np.ndarray:
 
 def _read_npy(path: Path) -> np.ndarray:
     try:
-        with local_file(path) as copy:
-            value = np.load(copy, allow_pickle=False)
+        value = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
     except OSError as error:
         raise UsageError(
             f"depth must be a file that can be read, got {path} ({error.strerror or 'damaged'})"

@@ -10,8 +10,8 @@ import torch
 
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.frames import list_files
-from torchrefract.data.images import opened
-from torchrefract.data.label_files import check_named, digest_of
+from torchrefract.data.images import opened, read_file
+from torchrefract.data.label_files import check_named, digest_of, files_with_suffix
 from torchrefract.data.pairs.files import DamagedPairError, decode_flow, encode_flow
 from torchrefract.labels.maps import warp_optical_flow
 from torchrefract.types import Degraded
@@ -41,8 +41,7 @@ class FlowFile(NamedTuple):
         Raises:
             ValueError: the file is damaged or of another size than the pictures.
         """
-        with opened(self.path) as stream:
-            data = stream.read()
+        data = read_file(self.path)
         motion, valid = self._decode(data)
         size = tuple(first.image.shape[2:])
         if valid.shape != size:
@@ -94,11 +93,11 @@ class FlowFolder(NamedTuple):
 
     def digest(self) -> str:
         """Return a SHA-256 digest of the names and contents of the files."""
-        return digest_of(self.root, self._files())
+        return digest_of(self.root, self.suffix)
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if a flow is of none of the pictures, or leads to none of them."""
-        files = {path.relative_to(self.root).as_posix() for path in self._files()}
+        files = files_with_suffix(self.root, self.suffix)
         pictures = {PurePosixPath(name).with_suffix(self.suffix).as_posix(): name for name in names}
         check_named(files - pictures.keys(), self.root)
         starts = sorted(pictures[file] for file in files)
@@ -107,9 +106,6 @@ class FlowFolder(NamedTuple):
                 f"source must hold the picture after each that has an optical flow, got none after "
                 f"{first_names(missing)}; give pictures consecutive numbers, or remove the flows that lead to none"
             )
-
-    def _files(self) -> list[Path]:
-        return [path for path in list_files(self.root) if path.suffix == self.suffix]
 
 
 def next_picture(name: str) -> str | None:

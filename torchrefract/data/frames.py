@@ -17,7 +17,7 @@ from typing import NamedTuple, NoReturn
 import torch
 from torch.utils.data import Dataset
 
-from torchrefract._io import as_path, is_remote, relative_name, sizes_in_store
+from torchrefract._io import as_path, is_remote, sizes_in_store
 from torchrefract._validation import check_choice, check_number, check_size, first_names, warn
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import EXTENSIONS, UnreadableImageError, fit, image_size, read_image, warn_of_unread
@@ -102,8 +102,9 @@ class FrameFolder(Dataset[Frame]):
             raise ValueError(f"val_share must be a number between 0 and 1, got {val_share}")
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(self.root, _find_files(self.root), split=split, **options)
-        readable, self.skipped = _check_frames(self.root, [frame.path for frame in frames], self.size)
-        frames = [frame for frame in frames if frame.path in readable]
+        unreadable = _check_frames(self.root, [frame.path for frame in frames], self.size)
+        self.skipped = [(self.root / path, reason) for path, reason in unreadable.items()]
+        frames = [frame for frame in frames if frame.path not in unreadable]
         self.names = [frame.path for frame in frames]
         self.drive_names = [frame.drive for frame in frames]
         self.drives = sorted(set(self.drive_names))
@@ -302,27 +303,31 @@ def select_val_drives(root: Path, drive_of: Mapping[str, str], *, val_share: flo
     return (val or {smallest}) if len(val) < len(frames) else val - {smallest}  # each split has at least one drive
 
 
-def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> tuple[set[str], list[tuple[Path, str]]]:
-    """Return the readable paths, and the unreadable ones with the reasons."""
-    with ThreadPoolExecutor(_REQUESTS if is_remote(root) else None) as pool:
-        results = list(pool.map(_size_or_reason, [root / path for path in paths]))
-    skipped = [(root / path, result) for path, result in zip(paths, results, strict=True) if isinstance(result, str)]
-    if skipped:
-        examples = first_names([f"{relative_name(path, root)} {reason}" for path, reason in skipped])
-        if len(skipped) > _MAX_UNREADABLE * len(paths):
+def _check_frames(root: Path, paths: list[str], size: tuple[int, int]) -> dict[str, str]:
+    """Return the result of `check_sizes`; warn of unreadable frames, and raise ValueError if they are many."""
+    if unreadable := check_sizes(root, paths, size):
+        examples = first_names([f"{path} {reason}" for path, reason in unreadable.items()])
+        if len(unreadable) > _MAX_UNREADABLE * len(paths):
             raise ValueError(
-                f"root must hold readable frames, got {len(skipped)} of {len(paths)} in {root} that are unreadable: "
+                f"root must hold readable frames, got {len(unreadable)} of {len(paths)} in {root} that are unreadable: "
                 f"{examples}; remove them or copy them again"
             )
-        warn(f"{len(skipped)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}")
-    sizes = {path: result for path, result in zip(paths, results, strict=True) if not isinstance(result, str)}
-    small = [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]
-    if small:
+        warn(f"{len(unreadable)} of {len(paths)} frames in {root} cannot be read and are skipped: {examples}")
+    return unreadable
+
+
+def check_sizes(root: Path, paths: Sequence[str], size: tuple[int, int]) -> dict[str, str]:
+    """Return why frames are unreadable, by path; raise ValueError if one of the others is smaller than `size`."""
+    with ThreadPoolExecutor(_REQUESTS if is_remote(root) else None) as pool:
+        results = dict(zip(paths, pool.map(_size_or_reason, [root / path for path in paths]), strict=True))
+    unreadable = {path: result for path, result in results.items() if isinstance(result, str)}
+    sizes = {path: result for path, result in results.items() if not isinstance(result, str)}
+    if small := [f"{path} of {H}x{W}" for path, (H, W) in sizes.items() if size[0] > H or size[1] > W]:
         raise ValueError(
             f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {first_names(small)} in {root}; "
             "choose a smaller size or remove them"
         )
-    return set(sizes), skipped
+    return unreadable
 
 
 def _size_or_reason(path: Path) -> tuple[int, int] | str:

@@ -112,11 +112,11 @@ def decode_image(data: bytes, path: str | Path, *, upright: bool = True) -> Tens
         path: of the file, for errors.
         upright: as for `read_image`.
     """
-    _check_complete(path, io.BytesIO(data), len(data))
+    # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
+    orientation = read_header(path, io.BytesIO(data)).orientation
     if data.startswith(_PNG) and not has_complete_png_chunks(data):
         raise UnreadableImageError(f"{path} is damaged: its chunks are shorter than they state")
-    # OpenCV would allocate any size that a header states; Pillow raises an error for a decompression bomb.
-    orientation, pixels = _read_header(path, io.BytesIO(data)).orientation, _decode(path, data)
+    pixels = _decode(path, data)
     if upright and orientation != 1:
         # OpenCV reads some orientations otherwise than Pillow, and then sizes would not be those of the header.
         pixels = pixels.swapaxes(0, 1) if orientation in _TRANSPOSED else pixels
@@ -161,18 +161,10 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def image_header(path: str | Path) -> ImageHeader:
-    """Read the header of an image, without decoding pixels, and check the end of its file.
-
-    Raises:
-        UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
-            `read_image` alone.
-    """
+    """Read the header of an image as `read_header` does."""
     # In a store, one request for the file is faster than several for its parts.
     with io.BytesIO(read_file(path)) if is_remote(path) else opened(path) as stream:
-        length = stream.seek(0, os.SEEK_END)
-        stream.seek(0)
-        _check_complete(path, stream, length)
-        return _read_header(path, stream)
+        return read_header(path, stream)
 
 
 @contextmanager
@@ -335,7 +327,14 @@ def reduce_by_area(maps: Tensor, size: Sequence[int]) -> Tensor:
     return torch.cat(parts).contiguous()
 
 
-def _read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
+def read_header(path: str | Path, stream: BinaryIO) -> ImageHeader:
+    """Read the header of an image from the stream of its file, without decoding pixels, and check its end.
+
+    Raises:
+        UnreadableImageError: the file is empty, truncated or not an image. Damage in between is detected by
+            `read_image` alone.
+    """
+    _check_complete(path, stream)
     try:
         with Image.open(stream) as header:
             width, height = header.size
@@ -401,10 +400,12 @@ def _silent_opencv() -> Iterator[None]:
                 OPENCV_LOG.setLogLevel(level)
 
 
-def _check_complete(path: str | Path, stream: BinaryIO, length: int) -> None:
-    """Raise UnreadableImageError unless a stream of `length` bytes is an image file with its end."""
+def _check_complete(path: str | Path, stream: BinaryIO) -> None:
+    """Raise UnreadableImageError unless a stream is an image file with its end."""
+    length = stream.seek(0, os.SEEK_END)
     if length == 0:
         raise UnreadableImageError(f"{path} is empty (0 bytes)")
+    stream.seek(0)
     head = stream.read(16)
     if head.startswith(_JPEG):
         is_complete = _contains(stream, _JPEG_END, _scan_start(stream, length), length)

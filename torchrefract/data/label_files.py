@@ -21,11 +21,11 @@ from torch import Tensor
 from torchrefract._io import file_digest
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.coco import Annotation, decompressed, problem_of
-from torchrefract.data.frames import list_files
-from torchrefract.data.images import image_header, opened
+from torchrefract.data.frames import list_names
+from torchrefract.data.images import image_header, read_file
 from torchrefract.labels.boxes import polygon_area, warp_boxes, warp_polygons
 from torchrefract.labels.maps import warp_mask
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, in_frame, solve_points
+from torchrefract.labels.points import in_frame, solve_points
 from torchrefract.labels.vehicles import LabeledBoxes
 
 _SUFFIXES = (".txt", ".png")  # of YOLO and masks
@@ -70,8 +70,7 @@ class YoloFile(NamedTuple):
 
     def move(self, flow: Tensor | None, size: tuple[int, int]) -> MovedLabels:
         """Move boxes and polygons along a flow (2, H, W), px, None for none; raise ValueError for an invalid line."""
-        with opened(self.path) as stream:
-            data = stream.read()
+        data = read_file(self.path)
         rows = yolo_rows(data, self.path)
         if flow is None or not rows:
             return MovedLabels(data, 0)
@@ -93,6 +92,24 @@ class YoloFile(NamedTuple):
         ]
         return MovedLabels("".join(f"{line}\n" for line in lines).encode(), len(rows) - len(lines))
 
+    def boxes(self, size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
+        """Read the boxes (N, 4), x1, y1, x2, y2, px from the edge of the first pixel, and their classes.
+
+        Args:
+            size: (H, W) of the picture.
+
+        Raises:
+            ValueError: an invalid line.
+        """
+        rows = yolo_rows(read_file(self.path), self.path)
+        points = [np.reshape(numbers, (-1, 2)) * (size[1], size[0]) for _, numbers in rows]
+        # The center and size of a box, or the corners of a polygon.
+        boxes = [
+            [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
+            for at in points
+        ]
+        return np.reshape(boxes, (-1, 4)), [int(name) for name, _ in rows]
+
 
 class MaskFile(NamedTuple):
     """The mask of one picture: a PNG whose ids, or palette, or colors, keep every bit."""
@@ -105,8 +122,7 @@ class MaskFile(NamedTuple):
         header = image_header(self.path)
         if header.size != size:
             raise ValueError(f"{self.path} must be of {size} px (height, width), as its picture, got {header.size}")
-        with opened(self.path) as stream:
-            data = stream.read()
+        data = read_file(self.path)
         if flow is None:
             return MovedLabels(data, 0)
         with Image.open(io.BytesIO(data)) as picture:
@@ -154,21 +170,18 @@ class LabelFolder(NamedTuple):
 
     def digest(self) -> str:
         """Return a SHA-256 digest of the names and contents of the files."""
-        return digest_of(self.root, self._files())
+        return digest_of(self.root, self.suffix)
 
     def check(self, names: Sequence[str]) -> None:
         """Raise UsageError if a file is of none of the pictures, or if a picture has no mask."""
         expected = {PurePosixPath(name).with_suffix(self.suffix).as_posix() for name in names}
-        files = {path.relative_to(self.root).as_posix() for path in self._files()}
+        files = files_with_suffix(self.root, self.suffix)
         check_named(files - expected, self.root)
         if self.suffix == ".png" and (missing := sorted(expected - files)):
             raise UsageError(
                 f"labels must hold a mask for each picture, got none for {first_names(missing)} in {self.root}; add "
                 "them, or move their pictures away"
             )
-
-    def _files(self) -> Iterator[Path]:
-        return (path for path in list_files(self.root) if path.suffix == self.suffix)
 
 
 class CocoLabels(NamedTuple):
@@ -211,7 +224,7 @@ def read_labels(path: Path, *, fill: int) -> CocoLabels | LabelFolder:
     """
     if path.is_file() and path.suffix.lower() == ".json":
         return _read_coco(path)
-    files = list(list_files(path)) if path.is_dir() else []
+    files = [*map(PurePosixPath, list_names(path))] if path.is_dir() else []
     kinds = {file.suffix for file in files} & {*_SUFFIXES}
     capital = [f.name for f in files if f.suffix != f.suffix.lower() and f.suffix.lower() in (kinds or _SUFFIXES)]
     if capital:
@@ -259,11 +272,16 @@ def _read_coco(path: Path) -> CocoLabels:
     return CocoLabels(path, document, images, annotations)
 
 
-def digest_of(root: Path, paths: Iterable[Path]) -> str:
-    """Return a SHA-256 digest of the names, relative to a root, and the contents of files."""
+def files_with_suffix(root: Path, suffix: str) -> set[str]:
+    """Return the names of the files of a folder and its sub-folders that have a suffix, relative to the folder."""
+    return {name for name in list_names(root) if name.endswith(suffix)}
+
+
+def digest_of(root: Path, suffix: str) -> str:
+    """Return a SHA-256 digest of the names and contents of the files of `files_with_suffix`."""
     digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(ascii((path.relative_to(root).as_posix(), file_digest(path))).encode())
+    for name in sorted(files_with_suffix(root, suffix), key=PurePosixPath):
+        digest.update(ascii((name, file_digest(root / name))).encode())
     return digest.hexdigest()
 
 
@@ -333,7 +351,7 @@ def _moved_keypoints(keypoints: Sequence[float], flow: Tensor) -> list[float]:
     if not keypoints:
         return []
     rows = torch.tensor(keypoints, dtype=flow.dtype).view(1, -1, 3)
-    points, converged, upright = solve_points(rows[..., :2], flow[None], STEPS, TOLERANCE_PX)
+    points, converged, upright = solve_points(rows[..., :2], flow[None])
     is_visible = converged & upright & in_frame(points, flow[None], 0.5) & (rows[..., 2] > 0)
     flat = (torch.cat([points, rows[..., 2:]], dim=2) * is_visible[..., None])[0].tolist()
     return [value for x, y, v in flat for value in (*_rounded([x, y]), int(v))]
@@ -399,27 +417,6 @@ def _are_keypoints(numbers: list[float]) -> bool:
     return all(v == 0 or (abs(a - x) <= width and abs(b - y) <= height) for a, b, v in keypoints)
 
 
-def boxes_of_yolo(data: bytes, labels: YoloFile, size: tuple[int, int]) -> tuple[np.ndarray, list[int]]:
-    """Return the boxes (N, 4), x1, y1, x2, y2, px from the edge of the first pixel, and classes of a YOLO file.
-
-    Args:
-        data: content of the file.
-        labels: name the file in messages.
-        size: (H, W) of the picture.
-
-    Raises:
-        ValueError: an invalid line.
-    """
-    scale = np.array([size[1], size[0]])
-    rows = [(int(name), np.reshape(numbers, (-1, 2)) * scale) for name, numbers in yolo_rows(data, labels.path)]
-    # The center and size of a box, or the corners of a polygon.
-    boxes = [
-        [*(at[0] - at[1] / 2), *(at[0] + at[1] / 2)] if len(at) == 2 else [*at.min(axis=0), *at.max(axis=0)]
-        for _, at in rows
-    ]
-    return np.reshape(boxes, (-1, 4)), [name for name, _ in rows]
-
-
 def boxes_of_coco(annotations: Sequence[Annotation]) -> np.ndarray:
     """Return the boxes (N, 4), x1, y1, x2, y2, px from the edge of the first pixel, of annotations with a bbox."""
     corners = np.reshape([annotation["bbox"] for annotation in annotations], (-1, 4)).astype(float)
@@ -434,12 +431,12 @@ def category_names(labels: CocoLabels) -> dict[int, str]:
 
 def labeled_boxes(labels: PictureLabels | None, size: tuple[int, int], names: Mapping[int, str]) -> LabeledBoxes:
     """Return the boxes of a picture of `size` (H, W) with their classes: names of COCO, numbers of YOLO."""
-    boxes, classes = np.zeros((0, 4)), list[int | str]()
+    boxes, classes = np.zeros((0, 4)), []
     if isinstance(labels, YoloFile):
-        boxes, numbers = boxes_of_yolo(labels.move(None, size).content, labels, size)
-        classes += numbers
+        boxes, classes = labels.boxes(size)
     elif isinstance(labels, CocoAnnotations):
         annotations = [annotation for annotation in labels.annotations if annotation.get("bbox")]
         boxes = boxes_of_coco(annotations)
-        classes += [names.get(ids, ids) for ids in (annotation.get("category_id", -1) for annotation in annotations)]
+        ids = [annotation.get("category_id", -1) for annotation in annotations]
+        classes = [names.get(number, number) for number in ids]
     return LabeledBoxes(torch.from_numpy(boxes).float() - 0.5, classes)

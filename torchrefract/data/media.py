@@ -30,35 +30,7 @@ from torchrefract.data.images import (
     pixels_of,
     warn_of_unread,
 )
-from torchrefract.data.video import (
-    can_write_videos,
-    convert_video,
-    count_frames,
-    decodable_frames,
-    is_turned_video,
-    read_video,
-    video_info,
-    video_losses,
-    write_video,
-)
-
-__all__ = [
-    "VIDEOS",
-    "can_write_videos",
-    "check_output_folder",
-    "convert_video",
-    "describe_losses",
-    "describe_turned",
-    "find_media",
-    "is_complete",
-    "is_older",
-    "is_video",
-    "output_name",
-    "read_video",
-    "video_info",
-    "write_picture",
-    "write_video",
-]
+from torchrefract.data.video import count_frames, decodable_frames, is_turned_video, video_info, video_losses
 
 # OpenCV prints to the terminal; problems are raised as errors instead.
 OPENCV_LOG.setLogLevel(OPENCV_SILENT)
@@ -69,14 +41,18 @@ _ENCODING = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95], ".jpeg": [cv2.IMWRITE_JPEG_
 _TAGGED = (".jpg", ".jpeg", ".png", ".webp")  # formats that hold EXIF data and color profiles
 
 
-def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequence[Path]:
+def find_media(source: Path, *, out: Path | None = None, deep: bool = False, name: str = "input") -> Sequence[Path]:
     """Find the pictures and videos of a folder, or return the one file that `source` names.
 
-    With `deep`, the folders below it are searched too. `name` is the option to blame.
+    Args:
+        source: the folder or the file.
+        out: folder of the outputs; None without any.
+        deep: True to search the folders below `source`, too.
+        name: of the option that gives `source`.
 
     Raises:
-        UsageError: if `source` does not exist or holds no picture or video, or if two videos would be written under one
-            name.
+        UsageError: if `source` does not exist or holds no picture or video, if two videos would be written under one
+            name, or if outputs would replace files of `source` or, with `deep`, be among them.
     """
     if not source.exists():
         raise UsageError(f"{name} must be a folder, a picture or a video, got {source}, which does not exist")
@@ -96,21 +72,13 @@ def find_media(source: Path, *, deep: bool = False, name: str = "input") -> Sequ
     names = Counter(str(output_name(file)) for file in files if is_video(file))
     if repeated := [name for name, count in names.items() if count > 1]:
         raise UsageError(f"{name} must not hold two videos of one name, got {', '.join(sorted(repeated))}")
+    if out is not None and is_remote(out) == is_remote(source):
+        folder = (source if source.is_dir() else source.parent).resolve()
+        if out.resolve() == folder:
+            raise UsageError(f"out must be another folder than that of {name}, got {out}")
+        if deep and source.is_dir() and out.resolve().is_relative_to(folder):
+            raise UsageError(f"out must be a folder that does not lie in that of {name}, got {out}")
     return files
-
-
-def check_output_folder(out: Path, source: Path, *, deep: bool = False, name: str = "input") -> None:
-    """Raise UsageError if files in `out` would replace those of `source` or, if `deep`, be among them.
-
-    `name` is the option of `source`.
-    """
-    if is_remote(out) != is_remote(source):
-        return
-    folder = (source if source.is_dir() else source.parent).resolve()
-    if out.resolve() == folder:
-        raise UsageError(f"out must be another folder than that of {name}, got {out}")
-    if deep and source.is_dir() and out.resolve().is_relative_to(folder):
-        raise UsageError(f"out must be a folder that does not lie in that of {name}, got {out}")
 
 
 def is_video(file: Path) -> bool:

@@ -1,7 +1,6 @@
 """Batches for training: workers load clean frames, and the training device degrades them."""
 
 import hashlib
-import json
 import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
@@ -16,6 +15,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler, default_co
 from torchrefract._io import is_remote, sizes_in_store
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag
 from torchrefract.data.frames import FrameFolder
+from torchrefract.data.pairs.configuration import CONFIG, read_config
 from torchrefract.data.pairs.dataset import PairBatches, PairedFolder, check_streamed
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.workers import ignore_sigterm
@@ -328,10 +328,9 @@ def fingerprint(frames: Dataset[Frame] | Dataset[Pair]) -> dict[str, Any]:
 def _license(pairs: PairedFolder) -> str | None:
     """Read the license of the frames from config.json."""
     try:
-        document = json.loads((pairs.root / "config.json").read_bytes())
-    except (OSError, ValueError):
+        text = read_config(pairs.root / CONFIG).get("license")
+    except (OSError, UsageError):
         return None
-    text = document.get("license") if isinstance(document, dict) else None
     return text if isinstance(text, str) else None
 
 

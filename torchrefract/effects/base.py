@@ -132,7 +132,7 @@ class Effect(nn.Module, ABC):
             degraded = self.apply(image, with_vehicles(self, self.sample(image), boxes))
         else:
             degraded = self.degrade(image)
-        is_tv = is_tv_tensor(image, "Image") or is_tv_tensor(image, "Video")
+        is_tv = is_tv_tensor(image, "Image", "Video")
         return wrap_like(degraded.image, image) if is_tv else degraded.image, degraded
 
     def _boxes(self, image: Any, targets: tuple[Any, ...]) -> list[LabeledBoxes]:
@@ -401,7 +401,7 @@ def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEff
 
 def _find_image(leaves: list[Any], names: list[str]) -> int:
     """Return the index of the image among the leaves of a sample, whose names are those in their dict."""
-    images = [k for k, leaf in enumerate(leaves) if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video")]
+    images = [k for k, leaf in enumerate(leaves) if is_tv_tensor(leaf, "Image", "Video")]
     if len(images) > 1:
         raise ValueError(
             f"image must be the only Image or Video of a sample, got {len(images)}; pass it as the first argument"

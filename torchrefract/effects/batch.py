@@ -63,7 +63,7 @@ def check_image(image: Tensor) -> BatchShape:
             "v2.functional.to_image of torchvision, or place v2.ToImage() before the effect"
         )
     check_tensor("image", image)
-    if type(image) is not Tensor and any(is_tv_tensor(image, kind) for kind in ("Mask", "KeyPoints", "BoundingBoxes")):
+    if type(image) is not Tensor and is_tv_tensor(image, "Mask", "KeyPoints", "BoundingBoxes"):
         raise TypeError(
             f"image must be an image, got {type(image).__name__} of torchvision; pass labels after the image, as in "
             "effect(image, mask)"

@@ -7,20 +7,13 @@ import torch
 from torch import Tensor
 
 from torchrefract._validation import check_count, check_flag, check_number, check_tensor, check_values
-from torchrefract.labels.points import (
-    STEPS,
-    TOLERANCE_PX,
-    check_coordinates,
-    frame_bounds,
-    in_frame,
-    pixel_subset,
-    solve_points,
-)
+from torchrefract.labels.points import check_coordinates, frame_bounds, in_frame, pixel_subset, solve_points
 from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.implicit import sample_linear
 
 # Probes along each side of the frame: they find the part of a box whose outline the frame does not show.
 _NUM_PROBES = 49
+_SAMPLES = 64  # points on each edge
 _STEP_PX = 1.0  # longest piece of an edge, between whose ends a flow is taken as linear
 
 
@@ -31,7 +24,7 @@ def warp_boxes(
     min_area: float = 0.0,
     min_visibility: float = 0.0,
     clip: bool = True,
-    samples: int = 64,
+    samples: int = _SAMPLES,
 ) -> tuple[Tensor, Tensor]:
     """Return the bounding boxes of warped boxes and a mask of the boxes to keep.
 
@@ -122,7 +115,7 @@ class Outlines(NamedTuple):
         return Extent(rectangle(self.converged, exists), rectangle(self.in_frame, visible), visible)
 
 
-def warp_outlines(corners: Tensor, flow: Tensor, *, samples: int) -> Outlines:
+def warp_outlines(corners: Tensor, flow: Tensor, *, samples: int = _SAMPLES) -> Outlines:
     """Warp the outlines of convex quadrilaterals, (B, N, 4, 2) in px, without checks."""
     dtype = field_dtype(torch.promote_types(corners.dtype, flow.dtype))
     corners, flow = corners.to(dtype), flow.to(dtype).expand(corners.shape[0], -1, -1, -1)
@@ -130,7 +123,7 @@ def warp_outlines(corners: Tensor, flow: Tensor, *, samples: int) -> Outlines:
     start, end = corners[..., None, :], corners.roll(-1, dims=2)[..., None, :]
     # Interpolate from the nearer end, so that both ends and a coordinate that they share stay exact.
     outline = torch.where(t < 0.5, start + t * (end - start), end - (1 - t) * (end - start))
-    solution = solve_points(outline.flatten(1, 3), flow, STEPS, TOLERANCE_PX)
+    solution = solve_points(outline.flatten(1, 3), flow)
     points, converged = solution.points.view(outline.shape), solution.converged.view(outline.shape[:-1])
     is_inside = converged & in_frame(points, flow, 0.5)
     # Clamp points that only rounding moved off the frame.
@@ -204,7 +197,7 @@ def warp_polygons(polygons: Sequence[Tensor], flow: Tensor) -> list[Tensor]:
         return []
     dtype = field_dtype(flow.dtype)
     pieces = [_divide(polygon.to(dtype)) for polygon in polygons]
-    solution = solve_points(torch.cat(pieces)[None], flow[None], STEPS, TOLERANCE_PX)
+    solution = solve_points(torch.cat(pieces)[None], flow[None])
     low, high = frame_bounds(flow[None], 0.5)
     sizes = [len(piece) for piece in pieces]
     warped = []

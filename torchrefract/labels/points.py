@@ -11,8 +11,8 @@ from torchrefract.warping.grid import field_dtype
 from torchrefract.warping.implicit import LinearSample, implicit, sample_linear
 
 # Smooth flows converge in 6 Newton steps; flows that nearly fold gain little beyond 16.
-STEPS = 16
-TOLERANCE_PX = 0.01
+_STEPS = 16
+_TOLERANCE_PX = 0.01
 # Nodes along each side of the lattice from which the search starts.
 _NUM_NODES = 17
 # Larger coordinates count as invalid; the square of this still fits into float32.
@@ -24,7 +24,7 @@ _CHUNK = 4096
 
 
 def warp_points(
-    points_xy: Tensor, flow: Tensor, *, steps: int = STEPS, tolerance_px: float = TOLERANCE_PX
+    points_xy: Tensor, flow: Tensor, *, steps: int = _STEPS, tolerance_px: float = _TOLERANCE_PX
 ) -> tuple[Tensor, Tensor]:
     """Map points of the input image to the warped image.
 
@@ -59,7 +59,7 @@ def warp_points(
     check_coordinates("points_xy", points_xy, flow, 2)
     check_count("steps", steps)
     check_positive("tolerance_px", tolerance_px)
-    solution = solve_points(points_xy, flow, steps, tolerance_px)
+    solution = solve_points(points_xy, flow, steps=steps, tolerance_px=tolerance_px)
     visible = solution.converged & solution.upright & in_frame(solution.points, flow, 0.0)
     return solution.points, visible
 
@@ -72,7 +72,9 @@ class PointSolution(NamedTuple):
     upright: Tensor  # (B, N), bool: the local orientation is that of most of the frame
 
 
-def solve_points(points: Tensor, flow: Tensor, steps: int, tolerance_px: float) -> PointSolution:
+def solve_points(
+    points: Tensor, flow: Tensor, *, steps: int = _STEPS, tolerance_px: float = _TOLERANCE_PX
+) -> PointSolution:
     """Solve q + flow(q) = p for points (B, N, 2) and a flow (B or 1, 2, H, W), without checks."""
     dtype = field_dtype(torch.promote_types(points.dtype, flow.dtype))
     p, flow = points.to(dtype).movedim(-1, 1), flow.to(dtype).expand(points.shape[0], -1, -1, -1)

@@ -19,15 +19,16 @@ from torchrefract._validation import check_choice, check_flag, check_tensor, eag
 from torchrefract.labels.boxes import check_box_limits, warp_boxes, warp_outlines
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.plain_values import check_moves, name_of
-from torchrefract.labels.points import STEPS, TOLERANCE_PX, check_coordinates, in_frame, solve_points
+from torchrefract.labels.points import check_coordinates, in_frame, solve_points
 from torchrefract.warping.warp import INTERPOLATIONS, PADDINGS, warp
 
+# Formats of rotated boxes, by their names in torchvision.
+ROTATED = ("XYWHR", "CXCYWHR", "XYXYXYXY")
 # Values without a position in the image, which pass unchanged.
 _PLAIN = (
     *(type(None), str, bytes, numbers.Number, np.generic, np.ndarray),
     *(enum.Enum, os.PathLike, datetime.date, datetime.time, datetime.timedelta),
 )
-_SAMPLES_PER_EDGE = 64
 _VISIBILITY_KEYS = ("visible", "visibility", "visibilities", "keypoints_visible", "keypoint_visibility")
 # Parts of names of values that describe the image or the camera, never one box.
 _OF_IMAGE = ("image", "img", "orig", "camera", "intrinsic", "extrinsic", "calib")
@@ -116,8 +117,10 @@ def warp_labels(
     check_choice("padding", padding, PADDINGS)
     check_choice("interpolation", interpolation, INTERPOLATIONS)
     check_labels_getter(labels_getter)
-    limits = (min_area, min_visibility, clip, drop, labels_getter)
-    return _warp_target(target, flow, _Options(*limits, soft_masks, mask_fill, padding, interpolation))
+    options = _Options(
+        min_area, min_visibility, clip, drop, labels_getter, soft_masks, mask_fill, padding, interpolation
+    )
+    return _warp_target(target, flow, options)
 
 
 def warp_moved_labels(target: Any, flow: Tensor, labels_getter: Any = "default", *, mask_fill: float = 0) -> Any:
@@ -133,10 +136,10 @@ def check_labels_getter(labels_getter: Any) -> Any:
     return labels_getter
 
 
-def is_tv_tensor(value: Any, name: str) -> bool:
-    """Return True if a value has the torchvision type `name`; torchvision is not imported for it."""
-    kind = getattr(sys.modules.get("torchvision.tv_tensors"), name, None)
-    return kind is not None and isinstance(value, kind)
+def is_tv_tensor(value: Any, *names: str) -> bool:
+    """Return True if a value has a torchvision type of one of the names; torchvision is not imported for it."""
+    module = sys.modules.get("torchvision.tv_tensors")
+    return isinstance(value, tuple([getattr(module, name, ()) for name in names]))
 
 
 def wrap_like(value: Tensor, like: Any) -> Any:
@@ -198,8 +201,11 @@ def _has_entries_of_boxes(node: Any, counts: set[int]) -> bool:
         return False
     if all(isinstance(entry, dict) for entry in node):
         return not any(is_tv_tensor(leaf, "BoundingBoxes") for leaf in pytree.tree_leaves(node))
-    return all(isinstance(entry, Tensor) and _num_rows(entry) != len(node) for entry in node) and not any(
-        is_tv_tensor(entry, kind) for entry in node for kind in ("BoundingBoxes", "Image", "Video")
+    return all(
+        isinstance(entry, Tensor)
+        and _num_rows(entry) != len(node)
+        and not is_tv_tensor(entry, "BoundingBoxes", "Image", "Video")
+        for entry in node
     )
 
 
@@ -222,7 +228,7 @@ def _restore_unmoved(leaf: Any, warped: _Warped, is_zero: Tensor) -> _Warped:
 
 def _warp_leaf(leaf: Any, flow: Tensor, options: _Options) -> _Warped:
     """Warp one leaf of a sample; flow is (2, H, W), or (B, 2, H, W) for leaves with a leading dimension B."""
-    if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video"):
+    if is_tv_tensor(leaf, "Image", "Video"):
         sampling = {"padding": options.padding, "interpolation": options.interpolation}
         return _Warped(wrap_like(warp(_as_batch(leaf, flow), _batched(flow), **sampling)[0].reshape(leaf.shape), leaf))
     if is_tv_tensor(leaf, "Mask"):
@@ -247,7 +253,7 @@ def _warp_keypoints(keypoints: Any, flow: Tensor) -> _Warped:
     _check_batch(plain, flow)
     rows = plain.reshape(batch.shape[0], plain[..., 0].numel() // batch.shape[0], 2)
     check_coordinates("keypoints", rows, batch, 2)
-    points, converged, upright = solve_points(rows, batch, STEPS, TOLERANCE_PX)
+    points, converged, upright = solve_points(rows, batch)
     # A keypoint may lie on the outer half of a border pixel.
     on_canvas = in_frame(points, batch, 0.5)
     visible = converged & upright & on_canvas
@@ -266,13 +272,14 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
     if len(plain) == 0:
         return _Warped(boxes, torch.ones(0, dtype=torch.bool, device=plain.device))
     plain = plain if plain.is_floating_point() else plain.to(flow.dtype)
-    if boxes.format.name in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
+    if boxes.format.name in ROTATED:
         warped, keep = _warp_rotated_boxes(plain, boxes.format.name, flow, options)
         warped = _cast(warped, boxes.dtype)
     else:
         corners = convert_boxes(plain, boxes.format.name, "XYXY") - 0.5
-        limits = {"min_area": options.min_area, "min_visibility": options.min_visibility}
-        warped, keep = warp_boxes(corners, flow, clip=options.clip, samples=_SAMPLES_PER_EDGE, **limits)
+        warped, keep = warp_boxes(
+            corners, flow, min_area=options.min_area, min_visibility=options.min_visibility, clip=options.clip
+        )
         if not options.drop:
             warped = torch.where(keep[:, None], warped, warped[:, :2].repeat(1, 2))
         warped = _cast(convert_boxes(warped + 0.5, "XYXY", boxes.format.name), boxes.dtype)
@@ -283,7 +290,7 @@ def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped
 
 def _warp_rotated_boxes(plain: Tensor, form: str, flow: Tensor, options: _Options) -> tuple[Tensor, Tensor]:
     corners = convert_boxes(plain, form, "XYXYXYXY").reshape(1, -1, 4, 2) - 0.5
-    outlines = warp_outlines(corners, flow[None], samples=_SAMPLES_PER_EDGE)
+    outlines = warp_outlines(corners, flow[None])
     axes = _box_axes(outlines.points, outlines.converged, corners)
     extent = outlines.extent(axes)
     keep = extent.keep(options.min_area, options.min_visibility)
@@ -354,12 +361,12 @@ def _rows_of_boxes(
 def _moves(leaf: Any) -> bool:
     """Return True for masks, keypoints, and lists with entries that may hold them."""
     is_list = type(leaf) in (list, tuple) and not _is_plain_list(leaf)
-    return is_list or is_tv_tensor(leaf, "Mask") or is_tv_tensor(leaf, "KeyPoints")
+    return is_list or is_tv_tensor(leaf, "Mask", "KeyPoints")
 
 
 def _num_rows(leaf: Any) -> int | None:
     """Return the length of a tensor, array or list along its first dimension; None for other values and images."""
-    if is_tv_tensor(leaf, "Image") or is_tv_tensor(leaf, "Video"):
+    if is_tv_tensor(leaf, "Image", "Video"):
         return None
     if isinstance(leaf, Tensor | np.ndarray):
         return leaf.shape[0] if leaf.ndim else None

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract.labels.plain_values import name_of
-from torchrefract.labels.targets import convert_boxes, is_tv_tensor
+from torchrefract.labels.targets import ROTATED, convert_boxes, is_tv_tensor
 
 # Names of classes, as data sets of roads write them.
 VEHICLES = (
@@ -69,17 +69,19 @@ def select_vehicles(samples: Sequence[LabeledBoxes], labels: Collection[int | st
     Returns:
         As many boxes for each image as the largest number of vehicles; those that it lacks are 0 and have no area.
     """
-    names = {label.lower() if isinstance(label, str) else label for label in labels}
+    names = {*map(_lower, labels)}
     chosen = [
-        sample.boxes
-        if sample.labels is None
-        else sample.boxes[[i for i, x in enumerate(sample.labels) if (x.lower() if isinstance(x, str) else x) in names]]
-        for sample in samples
+        boxes if classes is None else boxes[[i for i, label in enumerate(classes) if _lower(label) in names]]
+        for boxes, classes in samples
     ]
     result = like.new_zeros(len(samples), max(map(len, chosen), default=0), 4)
     for row, boxes in zip(result, chosen, strict=True):
         row[: len(boxes)] = boxes
     return result
+
+
+def _lower(label: int | str) -> int | str:
+    return label.lower() if isinstance(label, str) else label
 
 
 def check_vehicle_labels(labels: Sequence[int | str] | None) -> tuple[int | str, ...] | None:
@@ -95,7 +97,7 @@ def _corners(boxes: Any) -> Tensor:
     """Return the smallest upright boxes, (N, 4), px from the center of the first pixel."""
     plain, form = boxes.as_subclass(Tensor), boxes.format.name
     plain = plain if plain.is_floating_point() else plain.to(torch.float32)
-    if form not in ("XYWHR", "CXCYWHR", "XYXYXYXY"):
+    if form not in ROTATED:
         return convert_boxes(plain, form, "XYXY") - 0.5
     points = convert_boxes(plain, form, "XYXYXYXY").unflatten(-1, (4, 2))
     return torch.cat([points.amin(dim=-2), points.amax(dim=-2)], dim=-1) - 0.5

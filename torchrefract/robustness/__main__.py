@@ -32,7 +32,7 @@ Examples:
 
 from torchrefract.cli.entry import command
 
-main = command("robustness", __doc__, "robustness:test_robustness", file="data=my drive (1)", has_sweeps=False)
+main = command("robustness", __doc__, "robustness:test_robustness", has_sweeps=False)
 
 if __name__ == "__main__":
     main()

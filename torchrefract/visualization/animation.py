@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrefract._validation import UsageError
 from torchrefract.data.images import pixels_of
-from torchrefract.data.media import can_write_videos, write_video
+from torchrefract.data.video import can_write_videos, write_video
 from torchrefract.effects.base import Effect
 from torchrefract.types import Degraded
 from torchrefract.visualization.figures import (

@@ -12,10 +12,10 @@ import torch
 
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, fit, read_image
-from torchrefract.data.media import read_video, write_video
 from torchrefract.data.pairs.dataset import PairedFolder
 from torchrefract.data.pairs.generator import SourceReader
 from torchrefract.data.pairs.sources import Sources, draw_of, find_sources, table_of
+from torchrefract.data.video import read_video, write_video
 
 OPTIONS = {"size": None, "every": 1, "drive_by": "auto", "val_share": 0.3, "seed": 0}
 FRAMES = 9

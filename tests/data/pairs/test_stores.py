@@ -10,8 +10,8 @@ from processes import running, wait_for
 from stores import digests, failing_writes
 
 from torchrefract._io import as_path
-from torchrefract.data.media import write_video
 from torchrefract.data.pairs import PairedFolder, PairStream
+from torchrefract.data.video import write_video
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ def claim(
     out: Path,
     settings: Mapping[str, Any],
     *,
-    count: int,
-    about: Mapping[str, Any],
+    count: int = 0,
+    about: Mapping[str, Any] | None = None,
     earlier: Mapping[str, Any] | None = None,
     suffix: str = "",
 ) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def claim(
 
     Args:
         settings: everything that determines the content, of types that JSON has.
-        count: number of results; a later run may raise it.
+        count: number of results, which a later run may raise; 0 if the settings decide it.
         about: further entries of config.json that do not change the content.
         earlier: values of settings that folders of earlier versions do not state.
         suffix: of a shard, which gets a copy of config.json, so that `check_shards` can compare those of shards that
@@ -50,9 +50,9 @@ def claim(
     # List the folder before testing for config.json, because another shard may be writing to it.
     others = sorted(file.name for file in (out.iterdir() if out.is_dir() else ()) if not file.name.startswith("."))
     if path.is_file():
-        previous = _read(path)
-        for config in (previous, *map(_read, shard_configs(out))):
-            if different := _differences({**(earlier or {}), **config.get("settings", {})}, new, "there", "here"):
+        previous = read_config(path)
+        for config in (previous, *map(read_config, shard_configs(out))):
+            if different := differences({**(earlier or {}), **config.get("settings", {})}, new, "there", "here"):
                 raise UsageError(
                     f"out must be a folder of the same configuration, got {out}, where {different}; choose another "
                     "folder"
@@ -61,7 +61,7 @@ def claim(
                 raise UsageError(f"count must be at least that of the pairs in {out}, {config['count']}, got {count}")
     elif others:
         raise UsageError(f"out must be a new folder or one of this command, got {out}, which holds {others[0]}")
-    document = {"settings": new, "count": count, **about}
+    document = {"settings": new, "count": count, **(about or {})}
     for target in (path, path.with_name(f"config{suffix}.json")) if suffix else (path,):
         if document != previous or not target.is_file():
             write_file(target, json.dumps(document, indent=2) + "\n")
@@ -75,8 +75,8 @@ def check_shards(out: Path, settings: Mapping[str, Any], count: int) -> int:
         UsageError: shards have other settings, as those that were made in several folders and copied into one.
     """
     for path in shard_configs(out):
-        config = _read(path)
-        if different := _differences(config.get("settings", {}), settings, f"in {path.name}", f"in {CONFIG}"):
+        config = read_config(path)
+        if different := differences(config.get("settings", {}), settings, f"in {path.name}", f"in {CONFIG}"):
             raise UsageError(
                 f"out must hold shards of one configuration, got {out}, where {different}; make each set in a folder "
                 "of its own"
@@ -97,7 +97,8 @@ def remove_shard_config(manifest: Path) -> None:
         remove_file(path)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> dict[str, Any]:
+    """Read a config.json; raise UsageError if it is damaged."""
     try:
         config = json.loads(read_bytes(path))
     except ValueError:
@@ -111,7 +112,7 @@ def _has_valid_values(config: Mapping[str, Any]) -> bool:
     return isinstance(config.get("settings", {}), dict) and isinstance(config.get("count", 0), int)
 
 
-def _differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
+def differences(first: Any, second: Any, of_first: str, of_second: str) -> str:
     """Describe how settings differ; empty if they are equal."""
     before, after = dict(flatten(first)), dict(flatten(second))
     different = [name for name in before | after if before.get(name) != after.get(name)]

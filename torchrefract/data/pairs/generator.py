@@ -34,11 +34,11 @@ from torchrefract.data.images import (
     pixels_of,
     read_file,
 )
-from torchrefract.data.media import read_video
 from torchrefract.data.pairs.files import DEPTH, FLOWS, LIGHTS, PairArrays, count_out_of_range, encode_pair
 from torchrefract.data.pairs.manifest import LOST, PairRow, StoredFile, tar_path
 from torchrefract.data.pairs.ray_engine import map_in_actors
 from torchrefract.data.pairs.sources import draw_of
+from torchrefract.data.video import read_video
 from torchrefract.data.workers import map_in_processes
 from torchrefract.effects.base import Effect
 from torchrefract.effects.compose import Compose

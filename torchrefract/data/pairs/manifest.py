@@ -236,9 +236,9 @@ class Manifest:
                     remove_file(path)
                     remove_shard_config(path)
 
-    def add(self, rows: Iterable[PairRow]) -> None:
-        """Append the rows of pairs whose files are written."""
-        self._rows += rows
+    def add(self, row: PairRow) -> None:
+        """Append the row of a pair whose files are written."""
+        self._rows.append(row)
         if not is_remote(self.path) or time.monotonic() - self._last > _PART_SECONDS:
             self.flush()
 

@@ -13,9 +13,11 @@ import pyarrow.parquet as pq
 from torchrefract._io import is_remote, read_bytes, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
-from torchrefract.data.frames import Source, evenly_spaced, list_names, select_val_drives, split_frames
-from torchrefract.data.images import EXTENSIONS, UnreadableImageError, image_size
-from torchrefract.data.media import VIDEOS, video_info
+from torchrefract.data.frames import Source, check_sizes, evenly_spaced, list_names, select_val_drives, split_frames
+from torchrefract.data.images import EXTENSIONS
+from torchrefract.data.media import VIDEOS
+from torchrefract.data.pairs.configuration import differences
+from torchrefract.data.video import video_info
 from torchrefract.random import key_of
 
 LIST = "sources.parquet"  # the list in the folder of a set
@@ -96,9 +98,10 @@ def read_sources(path: Path, root: Path, options: dict[str, Any]) -> Sources:
         previous, skipped = about["options"], about["skipped"]
     except (pa.ArrowInvalid, ValueError, KeyError) as error:
         raise UsageError(f"files must be a list of frames that generate wrote, got {path}") from error
-    if different := [name for name in options if previous.get(name) != options[name]]:
-        shown = ", ".join(f"{name} is {previous.get(name)} there and {options[name]} here" for name in different)
-        raise UsageError(f"files must be a list of the same options, got {path}, where {shown}; choose another folder")
+    if different := differences({name: previous.get(name) for name in options}, options, "there", "here"):
+        raise UsageError(
+            f"files must be a list of the same options, got {path}, where {different}; choose another folder"
+        )
     return Sources(root, table.replace_schema_metadata(), skipped)
 
 
@@ -130,7 +133,11 @@ def find_sources(
     if not videos:
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(source, files, split=None, **options)
-        _check_sample(source, [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]], size or (1, 1))
+        sample = [frame.path for frame in frames[:: len(frames) // _SAMPLES or 1]]
+        unreadable = check_sizes(source, sample, size or (1, 1))
+        if len(unreadable) == len(sample):
+            reasons = first_names([f"{path} {reason}" for path, reason in unreadable.items()])
+            raise ValueError(f"root must hold readable frames, got {reasons} in {source}")
         return Sources(source, table_of(frames, size_of))
     if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
         both = f"{images[0]} and {videos[0]}"
@@ -143,7 +150,7 @@ def _find_video_frames(root: Path, sizes: Mapping[str, int | None], every: int, 
     counts = {path: video_info(root / path)[0] for path in paths}
     frames = [(path, index) for path in paths for index in range(0, counts[path], every)]
     if not frames:
-        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {', '.join(paths[:3])}")
+        raise UsageError(f"source must be a video with frames, or hold one, got {root} with {first_names(paths)}")
     folders = {path: path.rpartition("/")[0] for path in paths}
     drives = folders if len(set(folders.values())) > 1 else {path: path for path in paths}
     drive_of = {f"{path}#{index}": drives[path] for path, index in frames}
@@ -160,24 +167,6 @@ def draw_of(source: Source, *, seed: int, repeat: int) -> tuple[int, int]:
     """
     key = key_of(source.name if repeat == 0 else f"{source.name}\0{repeat}")
     return (seed << 32) + (source.split != "val"), key
-
-
-def _check_sample(root: Path, paths: Sequence[str], size: tuple[int, int]) -> None:
-    """Raise ValueError if a few images are all unreadable, or one is smaller than `size`."""
-    reasons = []
-    for path in paths:
-        try:
-            H, W = image_size(root / path)
-        except UnreadableImageError as error:
-            reasons.append(str(error).replace(f"{root}/", ""))
-            continue
-        if size[0] > H or size[1] > W:
-            raise ValueError(
-                f"frames must be at least size = {size[0]}x{size[1]} (height x width), got {path} of {H}x{W} in "
-                f"{root}; choose a smaller size or remove them"
-            )
-    if len(reasons) == len(paths):
-        raise ValueError(f"root must hold readable frames, got {first_names(reasons)} in {root}")
 
 
 def table_of(frames: Sequence[Source], size_of: Callable[[str], int | None]) -> pa.Table:

@@ -100,6 +100,12 @@ def test_the_package_imports_torch_and_numpy_only(printed):
     assert printed("package") == ("[]\n", "")
 
 
+def test_the_package_imports_its_presets_and_depth_networks(spawn, tmp_path):
+    names = "torchrefract.presets.cape_town_fog.__name__, torchrefract.depth.from_transformers.__name__"
+    outcome = spawn("-c", f"import torchrefract; print({names})", cwd=tmp_path)
+    assert (outcome.code, outcome.out) == (0, "cape_town_fog from_transformers\n")
+
+
 def test_plain_targets_do_not_import_torchvision(printed):
     assert printed("labels") == ("{'id': 3} False\n", "")
 

@@ -206,7 +206,25 @@ def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(sm
 
 def test_a_finished_run_cannot_be_resumed(call, trained):
     message = call("train", *trained.words, f"ckpt_path={trained.folder / 'last.ckpt'}", "hydra.run.dir=run").message
-    assert message == "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2"
+    assert message == (
+        "trainer.max_epochs must be above the 2 epochs of ckpt_path, got 2; eval scores a training that is complete"
+    )
+
+
+def test_a_run_that_is_resumed_in_another_folder_keeps_the_best_checkpoint(call, trained, tmp_path):
+    (tmp_path / "old").mkdir()
+    shutil.copy(trained.folder / "best.ckpt", tmp_path / "old")
+    content = torch.load(trained.folder / "last.ckpt", weights_only=True)
+    (state,) = (state for name, state in content["callbacks"].items() if "'monitor': 'val/epe'" in name)
+    score = torch.zeros(())  # no later epoch is better
+    state |= {"best_model_score": score, "best_k_models": {state["best_model_path"]: score}}
+    torch.save(content, tmp_path / "old" / "last.ckpt")
+    words = ("ckpt_path=old/last.ckpt", "trainer.max_epochs=3", "hydra.run.dir=new")
+    outcome = call("train", *trained.words, *words)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert (tmp_path / "new" / "best.ckpt").read_bytes() == (trained.folder / "best.ckpt").read_bytes()
+    gain = metrics(tmp_path / "new", "val/epe_identity")[2]
+    assert outcome.out.splitlines()[-1].startswith(f"best.ckpt: better than doing nothing by {gain:.2f} px")
 
 
 @pytest.mark.parametrize(
@@ -389,6 +407,7 @@ def test_an_evaluation_scores_by_default_what_the_checkpoint_was_validated_on_an
             "as in its own validation"
         )
         assert model_line(outcome.out) == score
+        assert not list(outcome.folder.rglob("*.ckpt"))
     outcome = call("eval", f"ckpt_path={checkpoint}", "data.val_count=2", "scene=paper_refractive", "scene.severity=5")
     (line,) = (line for line in outcome.out.splitlines() if line.startswith("scoring "))
     assert line.endswith(

@@ -40,6 +40,8 @@ if _sys.argv[:1] == ["-m"] and _sys.stderr is not None:
     _sys.excepthook = _show_error
     print("torchrefract: loading …", file=_sys.stderr, flush=True)
 
+from torchrefract import depth as depth
+from torchrefract import presets as presets
 from torchrefract.cameras.camera import Camera
 from torchrefract.effects.chromatic_aberration import ChromaticAberration, ChromaticAberrationParams
 from torchrefract.effects.compose import Compose, ComposeParams, OneOf

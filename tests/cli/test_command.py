@@ -339,6 +339,8 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
         ("data=null", "data must be one of frames, pairs, road_scenes, got null$"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),
         ("data.color=red", "data.color"),
+        ("data.worker=1", r"data.worker.*; did you mean data.workers\?$"),
+        ("frames", "an option must be NAME=VALUE, got frames$"),
         ("+model.depth=3", "model: .*'depth'"),
         ("model.network.encoder=tu-nonsense", "model: encoder must be a name of .*, got tu-nonsense"),
         ("data.size=[64", r"\[64"),

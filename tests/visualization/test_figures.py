@@ -160,6 +160,11 @@ def test_an_effect_that_is_not_applied_says_so(frame):
     assert describe_params(none, none.sample(frame, seed=0)) == "not applied"
 
 
+def test_an_effect_without_parameters_has_no_parentheses(frame):
+    effect = tr.Compose([FOG, tr.NightGlow()])
+    assert describe_params(effect, effect.sample(frame, seed=0)) == "UniformFog (visibility 100 m) + NightGlow"
+
+
 def test_the_score_of_fog_behind_a_lens_says_that_the_fog_remains(frame):
     row = contact_sheet_row("both", tr.Compose([FOG, tr.LensDistortion()]), frame=frame, seed=1)
     assert [scale.name for scale in row.scales] == ["flow"]

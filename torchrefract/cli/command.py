@@ -21,7 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.progress import track
 from torch import nn
@@ -144,6 +144,8 @@ def prepare_arguments(name: str, arguments: list[str]) -> list[str]:
     for i, argument in enumerate(arguments):
         is_value = i > 0 and arguments[i - 1] in _OPTIONS_WITH_VALUE
         (options if is_value or argument.startswith("-") else overrides).append(argument)
+    if bare := [override for override in overrides if "=" not in override and not override.startswith("~")]:
+        raise UsageError(f"an option must be NAME=VALUE, got {bare[0]}")
     return [quote_text(override, is_multirun=is_multirun) for override in overrides] + options
 
 
@@ -396,7 +398,7 @@ def _user_message(error: Exception, name: str) -> str | None:
         return str(error).strip().splitlines()[-1].split("Error: ", 1)[-1]  # a worker prepends its traceback
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))
-        return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split())
+        return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split()) + _similar_key(error)
     return _file_message(error) if isinstance(error, OSError) else _worker_message(error)
 
 
@@ -421,6 +423,15 @@ def _unknown_option(name: str, option: str) -> str:
     similar = difflib.get_close_matches(option, options, n=1)
     hint = f"; did you mean {similar[0]}?" if similar else ""
     return f"an option must be one of {', '.join(options)}, got {option}{hint}"
+
+
+def _similar_key(error: Exception) -> str:
+    """Return a hint at the key of a part of the configuration that is most similar to the given one."""
+    cause = error.__cause__
+    if not (isinstance(cause, ConfigAttributeError) and isinstance(cause.parent_node, DictConfig)):
+        return ""
+    similar = difflib.get_close_matches(str(cause.key), map(str, cause.parent_node), n=1)
+    return f"; did you mean {str(cause.full_key).removesuffix(str(cause.key))}{similar[0]}?" if similar else ""
 
 
 def _options(name: str) -> list[str]:

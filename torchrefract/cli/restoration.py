@@ -90,7 +90,10 @@ def train(cfg: DictConfig) -> None:
     with naming("trainer"):
         limit = None if trainer.max_epochs is None else check_count("max_epochs", trainer.max_epochs, low=-1)
     if num_epochs and limit is not None and -1 < limit <= num_epochs:
-        raise UsageError(f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}")
+        raise UsageError(
+            f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}; eval scores a "
+            "training that is complete"
+        )
     if checkpoint and (changed := changed_values(cfg, checkpoint, ignored=("workers", "pretrained"))):
         print_warning(f"the training continues with other values than before of {', '.join(changed)}")
     initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))

@@ -46,7 +46,8 @@ def pretrained(name: str) -> "Loaded":
     """
     names = model_names()
     if name not in names:
-        raise ValueError(f"name must be {' or '.join(names)}, got {name!r}")
+        remedy = "torchrefract.restoration.checkpoints.load_model reads files"
+        raise ValueError(f"name must be {' or '.join(names)}, got {name!r}; {remedy}")
     try:
         from torchrefract.restoration.checkpoints import load_model  # noqa: PLC0415 - only models need Lightning
     except ImportError as error:

@@ -13,11 +13,22 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.loggers import CSVLogger
+from pytorch_lightning.trainer.states import TrainerFn
 from pytorch_lightning.utilities import rank_zero_only
 from torch import Tensor
 
-from torchrefract._io import as_path, is_remote, matching_files, write_csv, write_figure
+from torchrefract._io import (
+    as_path,
+    is_remote,
+    make_folder,
+    matching_files,
+    read_bytes,
+    write_csv,
+    write_figure,
+    write_file,
+)
 from torchrefract.data.drive_lenses import bent_drives
 from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.module import PairData, fingerprint
@@ -55,6 +66,22 @@ class RunSummary(Callback):
         if self.resumed_run is not None and self.resumed_run.resolve() == self.run_dir.resolve():
             carry_over(self.resumed_run, self.run_dir)  # the logger deletes the table when the run starts
         self._examples: tuple[Restored, Pair] | None = None
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Copy best.ckpt of the run that this one resumes, which ModelCheckpoint would forget in another folder."""
+        best = trainer.checkpoint_callback  # of best.ckpt, as the first of its kind
+        if self.resumed_run is None or not isinstance(best, ModelCheckpoint) or trainer.state.fn != TrainerFn.FITTING:
+            return
+        source, target = self.resumed_run / "best.ckpt", self.run_dir / "best.ckpt"
+        state = checkpoint["callbacks"].get(best.state_key)
+        if not state or state["best_model_score"] is None or not source.is_file():
+            return
+        if trainer.is_global_zero and source.resolve() != target.resolve():
+            make_folder(self.run_dir)
+            write_file(target, read_bytes(source))
+        path = f"{best.dirpath}/{target.name}"
+        state |= {"dirpath": best.dirpath, "best_model_path": path, "kth_best_model_path": path}
+        state["best_k_models"] = {path: state["best_model_score"]}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Copy the metrics of the run that this one resumes; print on what it trains."""

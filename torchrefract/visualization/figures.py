@@ -194,7 +194,7 @@ def describe_params(effect: Effect, params: Any) -> str:
     """Describe the parameters of the first sample, "amplitude 2.3 px, length 31 px"; zeros are left out."""
     if isinstance(effect, Compose):
         leaves = [
-            f"{type(leaf).__name__} ({describe_params(leaf, leaf_params)})"
+            f"{type(leaf).__name__} ({describe_params(leaf, leaf_params)})".removesuffix(" ()")
             for leaf, leaf_params in effect.effects_with_params(params)
             if leaf_params.applied[0]
         ]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from torchrefract.cameras.calibration.boards import Chessboard
+from torchrefract.cameras.calibration.choice import Candidate
 from torchrefract.cameras.calibration.detection import View
 from torchrefract.cameras.calibration.fit import fit_camera
 from torchrefract.cameras.calibration.report import (
@@ -38,6 +39,14 @@ def test_vague_coefficients_folds_and_empty_sides_are_warned_of(projected):
     assert "The model folds back inside the frame: " in text
     middle = [view._replace(corners=400 + 0.2 * (view.corners - 400)) for view in views]
     assert any("left (6 of 6 cells)" in message for message in calibration_warnings(middle, fit))
+
+
+def test_fewer_coefficients_are_not_suggested_of_a_model_that_held_out_views_chose(projected):
+    views = projected(BOARD, CAMERA, noise=0.2)
+    fit = fit_camera(views, BOARD, model="opencv14", size=(800, 600))
+    chosen = Candidate("opencv14", "none", 14, 0.2, 0.0, 0.0, "")
+    assert any("fewer coefficients" in message for message in calibration_warnings(views, fit))
+    assert not any("fewer coefficients" in message for message in calibration_warnings(views, fit, [chosen]))
 
 
 def test_a_good_calibration_has_no_warnings(projected):

@@ -160,6 +160,14 @@ def test_concatenated_manifests_of_shards_are_one_set(made, call, words, tmp_pat
     assert [one.row(i) for i in range(len(one))] == [several.row(i) for i in range(len(several))]
 
 
+def test_the_remedy_for_a_set_without_pairs_for_validation_is_named(made, tmp_path):
+    lines = (made() / "manifest.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "manifest.jsonl").write_text("".join(line for line in lines if '"split":"train"' in line))
+    assert len(PairedFolder(tmp_path, split="train")) == len(PairedFolder(made(), split="train"))
+    with pytest.raises(ValueError, match=r"got none in .*; generate it from frames of two or more drives"):
+        PairedFolder(tmp_path, split="val")
+
+
 @pytest.mark.quick
 def test_pixels_of_a_flow_beyond_512_px_are_marked_as_invalid():
     flow = np.zeros((2, 1, 5), np.float32)

@@ -290,7 +290,7 @@ def calibration_warnings(views: Sequence[View], fit: Fit, candidates: Sequence[C
         for name, value, deviation in rows
         if deviation > 0 and abs(value) < _NUM_DEVIATIONS * deviation
     ]
-    if vague:
+    if vague and not candidates:  # held-out views choose the fewest coefficients
         messages.append(
             f"These coefficients are zero within two standard deviations: {', '.join(vague)}. A lens_model with fewer "
             "coefficients may be enough."

@@ -69,7 +69,8 @@ class PairedFolder(Dataset[Pair]):
             for row, location in scan_rows(self._manifests, self._is_in_split)
         ]
         if not rows:
-            raise ValueError(f"root must hold pairs of the split {split}, got none in {self.root}")
+            remedy = "; generate it from frames of two or more drives" if split == "val" else ""
+            raise ValueError(f"root must hold pairs of the split {split}, got none in {self.root}{remedy}")
         self._locations = np.array(sorted(rows), dtype=np.int64)
 
     def __len__(self) -> int:

@@ -246,8 +246,10 @@ def test_labels_move_along_and_in_a_composition_the_scene_is_sampled_once():
         expected = torch.tensor([WIDTH / 2 + x * grown, HEIGHT / 2 + y * grown])
         assert_close(moved[0, 2 * corner : 2 * corner + 2].float(), expected, atol=0.5, rtol=0)
     lens = LensDistortion(frame="pad")
-    plan = Compose([Turbulence(), RollingShutter(), lens]).plan(HEIGHT, WIDTH)
-    assert plan.num_samplings == 1
+    for exposure, samplings in ((0.0, 1), (10.0, 4)):
+        shutter = RollingShutter(exposure_range=(0.0, exposure), num_exposures=4)
+        for effect in (shutter, Compose([Turbulence(), shutter, lens])):
+            assert effect.plan(HEIGHT, WIDTH).num_samplings == samplings
 
 
 def test_an_exposure_averages_images_at_times_within_it():

@@ -142,7 +142,9 @@ class Compose(Effect):
         )
         names = tuple(type(effect).__name__ for effect in effects)
         samplings = sum(
-            any(effects[place].p > 0 and not plans[place].is_identity for place in group) for group in groups
+            max(len(effects[place].moments()) for place in group)
+            for group in groups
+            if any(effects[place].p > 0 and not plans[place].is_identity for place in group)
         )
         return ComposePlan(height, width, self.tolerance_px, names, each, tuple(composed), error, samplings)
 

@@ -115,6 +115,7 @@ class Degraded:
     valid: (B, 1, H, W), bool, the pixels that show a part of the clean image.
     restore_flow: (B, 2, H, W), px, with warp(image, restore_flow) = clean on restore_valid; None without a flow.
     restore_valid: (B, 1, H, W), bool; None without a flow.
+    inverse: `restore_flow` and where it exists, both in an `Inverse`; None without a flow.
     folding: share of folded pixels and smallest Jacobian determinant of the flow on `valid`, (B,) each; None without a
         flow.
     restore_residual: (B, 1, H, W), px, distance between a pixel and where the flow and the restore flow together map

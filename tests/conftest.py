@@ -414,7 +414,7 @@ def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Ou
     monkeypatch.chdir(tmp_path)
     on_threads(1)
     # A slow machine would print lines of progress between the lines that tests compare.
-    monkeypatch.setattr(importlib.import_module("torchrefract.cli.command"), "_MESSAGE_INTERVAL", 3600.0)
+    monkeypatch.setattr(importlib.import_module("torchrefract.cli.progress"), "_MESSAGE_INTERVAL", 3600.0)
     # Hydra composes the configuration once more to read hydra.mode, which no command sets; that takes 0.1 s.
     monkeypatch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
     hydra = importlib.import_module("hydra.core.global_hydra").GlobalHydra.instance()

@@ -95,6 +95,7 @@ def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):
         (("input=raw", "out=cam.txt"), "out must end in .xml, .yml or .yaml, got cam.txt"),
         (("input=raw", "out=raw"), "out must end in .xml, .yml or .yaml, got raw"),
         (("input=raw", "out=raw/0.png/cam.yaml"), "out must name what can be read or written, got raw/0.png: "),
+        (("input=raw", "out=/proc/cam.yaml"), "out must name what exists, got /proc: "),
         (("input=nothing",), "input must be a folder, a picture or a video, got nothing, which does not exist"),
         (("input=raw", "checkpoint=none.ckpt"), "checkpoint must be a checkpoint file, such as "),
         (("input=raw", "checkpoint=raw/0.png"), "checkpoint must be an intact checkpoint, got raw/0.png, "),

@@ -36,6 +36,13 @@ def test_a_failure_keeps_the_old_file_and_deletes_the_temporary_one(tmp_path, er
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_name_of_the_longest_length_is_written(tmp_path, alone):
+    path = tmp_path / ("\udcffü" + "a" * 248 + ".png")  # of 255 bytes
+    write_file(path, "new", alone=alone)
+    assert path.read_text() == "new"
+
+
 @pytest.mark.parametrize("is_named", [False, True])
 def test_an_error_of_writing_names_the_file(tmp_path, is_named):
     with (

@@ -11,7 +11,7 @@ from PIL import Image
 from torchrefract import warp
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli import restoration
-from torchrefract.cli.command import Skipped
+from torchrefract.cli.progress import Skipped
 from torchrefract.data.images import pixels_of, read_image
 from torchrefract.data.video import read_video, video_info, write_video
 from torchrefract.fields.rectification import camera_flow

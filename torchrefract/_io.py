@@ -167,6 +167,16 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
+def make_writable_folder(path: Path) -> None:
+    """Create a folder of this machine with its parents; raise OSError if no file can be created in it."""
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        tempfile.TemporaryFile(dir=path).close()
+    except OSError as error:
+        error.filename = str(path)  # not of the temporary file
+        raise
+
+
 @contextmanager
 def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
     """Yield a temporary path; move it to `path` if the block succeeds, otherwise delete it.
@@ -184,9 +194,9 @@ def replace_file(path: Path, *, alone: bool = False) -> Iterator[Path]:
             yield (temporary := Path(folder, path.name))
             retried(lambda: store_of(path).put_file(str(temporary), cast(Any, path).path), path)
         return
-    # tempfile creates files that only their owner can read.
-    name = f".{path.stem}.part{path.suffix}" if alone else f".{path.stem}-{uuid4().hex[:8]}{path.suffix}"
-    temporary = path.with_name(name)
+    # tempfile creates files that only their owner can read. A digest is no longer than a long name may be.
+    unique = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:32] if alone else uuid4().hex
+    temporary = path.with_name(f".{unique}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

@@ -20,9 +20,10 @@ from processes import running
 
 from torchrefract._io import CONFIG_DIR
 from torchrefract._validation import UsageError
-from torchrefract.cli.command import prepare_arguments, progress, quote_text, run
+from torchrefract.cli.command import prepare_arguments, quote_text, run
 from torchrefract.cli.entry import command
 from torchrefract.cli.options import disk_errors, naming
+from torchrefract.cli.progress import progress
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import UnreadableImageError
 from torchrefract.restoration.checkpoints import AtomicCheckpointIO, read_checkpoint
@@ -161,7 +162,7 @@ def test_naming_adds_the_part_to_errors_of_values_only():
 def test_progress_hands_on_its_items_and_prints_a_line_outside_a_terminal_only_if_they_take_long(capsys, monkeypatch):
     assert list(progress(range(3), "working", count=3)) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
-    monkeypatch.setattr("torchrefract.cli.command._MESSAGE_INTERVAL", 0.02)
+    monkeypatch.setattr("torchrefract.cli.progress._MESSAGE_INTERVAL", 0.02)
     for item in progress(range(2), "working", count=2):
         if item == 1:
             time.sleep(0.2)

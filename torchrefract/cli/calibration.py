@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file, write_figure, write_file
+from torchrefract._io import make_writable_folder, replace_file, write_figure, write_file
 from torchrefract._validation import UsageError, check_choice, check_number
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
@@ -41,8 +41,8 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
-from torchrefract.cli.command import Skipped, check_none_lost, print_warning, progress
 from torchrefract.cli.options import make, naming, read_option
+from torchrefract.cli.progress import Skipped, check_none_lost, print_warning, progress
 from torchrefract.data import media
 from torchrefract.data.images import (
     EXTENSIONS,
@@ -97,7 +97,7 @@ def calibrate(cfg: DictConfig) -> None:
     max_drop_share = read_option(cfg, "drop_share", check_number, low=0.0, high=0.9)
     out = Path(str(cfg.out))
     with naming("out"):
-        out.mkdir(parents=True, exist_ok=True)
+        make_writable_folder(out)
     files = _rendered(board, out / "rendered") if str(cfg.images) == _SYNTHETIC else find_pictures(str(cfg.images))
     if turned := media.describe_turned(files):
         print(turned)

@@ -7,14 +7,11 @@ import os
 import re
 import signal
 import sys
-import threading
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -22,20 +19,13 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, MissingMandatoryValue, OmegaConfBaseException
-from rich.console import Console
-from rich.progress import track
-from torch import nn
 from yaml import YAMLError
 
 from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract._validation import UsageError
 from torchrefract.cli.entry import missing_library
 from torchrefract.cli.options import FILE_ERRORS
-from torchrefract.fields.corridor import CorridorDepth
 
-_T = TypeVar("_T")
-
-_MESSAGE_INTERVAL = 10.0  # seconds between two lines of progress outside a terminal
 _WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 _WRITING_ERRORS += (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG)  # a file has the name of the folder, and the like
 _INFORMATION_OPTIONS = ("--hydra-help", "--info", "--shell-completion", "-sc")
@@ -208,95 +198,6 @@ def picture_as_option(arguments: list[str]) -> list[str]:
         names = " and ".join(arguments[i] for i in pictures)
         raise UsageError(f"preview must have one picture, in quotes if its name has spaces, got {names}")
     return [f"image={_quote(argument)}" if i in pictures else argument for i, argument in enumerate(arguments)]
-
-
-def print_warning(message: str) -> None:
-    """Print a warning to the user as one line."""
-    print(f"warning: {message}", file=sys.stderr)
-
-
-def warn_of_assumed_depth(effect: nn.Module) -> None:
-    """Print that a part of the effect assumes the depth of frames, for a command that has no depth maps."""
-    for part in effect.modules():
-        source = getattr(getattr(part, "medium", part), "depth", None)
-        if isinstance(source, CorridorDepth):
-            print_warning(
-                f"{type(part).__name__} assumes the depth of a road between walls; depth maps, as estimate_depth "
-                "writes them, are better: depth=..."
-            )
-            return
-
-
-def progress(items: Iterable[_T], name: str, *, count: int) -> Iterator[_T]:
-    """Yield `count` items; show a progress bar in a terminal, and print a line each ten seconds elsewhere."""
-    console = Console(stderr=True)
-    if console.is_terminal:
-        yield from track(items, name, total=count, console=console, transient=True)
-        return
-    done, finished = 0, threading.Event()
-
-    def report() -> None:
-        start = time.monotonic()
-        while not finished.wait(_MESSAGE_INTERVAL):
-            seconds = time.monotonic() - start
-            left = f", about {seconds * (count - done) / done:.0f} s left" if done else ""
-            print(f"{name}: {done} of {count}, {seconds:.0f} s{left}", file=sys.stderr, flush=True)
-
-    threading.Thread(target=report, daemon=True).start()
-    try:
-        for item in items:
-            yield item
-            done += 1
-    finally:
-        finished.set()
-
-
-def batches(items: Iterable[_T], size: int) -> Iterator[list[_T]]:
-    """Yield up to `size` items in a row, as itertools.batched of Python 3.12 does."""
-    rest = iter(items)
-    while batch := list(islice(rest, size)):
-        yield batch
-
-
-class Skipped:
-    """The files or frames of an input that a command skips, by the errors that name them."""
-
-    def __init__(self):
-        self.errors, self.lost = list[str](), list[str]()  # all, and those of files that vanished
-
-    def add(self, error: str, *, is_lost: bool = False) -> None:
-        """Print an error and note it; an exception would keep frames and open files until the end."""
-        print(f"skipped: {error}", file=sys.stderr)
-        self.errors.append(error)
-        self.lost += [error] if is_lost else []
-
-    def summarize(self, verb: str, *, total: int, existing: int, name: str = "input") -> str:
-        """Return how many files were converted; raise UsageError if all were skipped.
-
-        Args:
-            verb: what the command does to a file, as "restored".
-            total: number of files.
-            existing: number of those that were converted before.
-            name: of the option that gives the input.
-        """
-        if len(self.errors) == total:
-            raise UsageError(f"{name} must hold a file that can be {verb}, got {self.errors[0]}")
-        num_made = total - existing - len(self.errors)
-        return f"{num_made} {verb}, {existing} already existed, {len(self.errors)} skipped"
-
-
-def check_none_lost(lost: Sequence[str], *, name: str = "input") -> None:
-    """Raise UsageError if files of the input could not be opened, as those that vanish during a run.
-
-    Args:
-        lost: the error of each such file.
-        name: option that names the input.
-    """
-    if lost:
-        more = f" and {len(lost) - 1} more" if lost[1:] else ""
-        raise UsageError(
-            f"{name} must stay unchanged during a run, got {lost[0]}{more}; the same command tries them again"
-        )
 
 
 def _is_picture(argument: str) -> bool:

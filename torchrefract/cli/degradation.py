@@ -21,7 +21,6 @@ from torch.utils import _pytree as pytree
 
 from torchrefract._io import is_remote, make_folder, relative_name, replace_file, sizes_in_store, write_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
-from torchrefract.cli.command import Skipped, check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_seed,
     depth_folder,
@@ -33,6 +32,7 @@ from torchrefract.cli.options import (
     read_workers,
     source_and_out,
 )
+from torchrefract.cli.progress import Skipped, check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.flow_files import FlowFile, FlowFolder, read_flows

@@ -10,14 +10,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from torchrefract._io import is_remote, make_folder, matching_files, relative_name
+from torchrefract._io import is_remote, make_folder, make_writable_folder, matching_files, relative_name
 from torchrefract._validation import UsageError, check_count, first_names
 from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.command import Skipped, batches, print_warning, progress
 from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
+from torchrefract.cli.progress import Skipped, batches, print_warning, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.frames import drives_of, evenly_spaced
@@ -152,7 +152,7 @@ def estimate_camera(
             "estimate each camera by itself"
         )
     with naming("out"):
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_writable_folder(out.parent)
     chosen = _select_frames(files, max_frames)
     total = sum(len(times) for _, times in chosen)
     frames = progress(_read_frames(chosen, upright=upright), "estimating the lens", count=total)

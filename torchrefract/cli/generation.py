@@ -27,7 +27,6 @@ from torchrefract._validation import (
     check_size,
     first_names,
 )
-from torchrefract.cli.command import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_seed,
     depth_folder,
@@ -41,6 +40,7 @@ from torchrefract.cli.options import (
     read_path,
     read_workers,
 )
+from torchrefract.cli.progress import check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.media import describe_turned

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchrefract._io import replace_file, write_figure
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
-from torchrefract.cli.command import print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
+from torchrefract.cli.progress import print_warning, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import DepthFolder, crop_depth, read_depth
 from torchrefract.data.images import EXTENSIONS, files_in, fit, natural_order, read_image
 from torchrefract.data.media import VIDEOS, describe_turned

@@ -19,10 +19,17 @@ from pytorch_lightning import Trainer, seed_everything
 from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor
 
-from torchrefract._io import as_path, file_digest, make_folder, matching_files, remove_file, replace_file
+from torchrefract._io import (
+    as_path,
+    file_digest,
+    make_folder,
+    make_writable_folder,
+    matching_files,
+    remove_file,
+    replace_file,
+)
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import Skipped, batches, check_none_lost, print_warning, progress
 from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
@@ -35,6 +42,7 @@ from torchrefract.cli.options import (
     read_option,
     read_optional,
 )
+from torchrefract.cli.progress import Skipped, batches, check_none_lost, print_warning, progress
 from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
@@ -190,7 +198,7 @@ def export(cfg: DictConfig) -> None:
     out, loaded = Path(str(cfg.out)), load_model(str(cfg.ckpt_path))
     with naming("out"):
         check_choice("out", out.suffix, (*FORMATS, WEIGHTS_SUFFIX))
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_writable_folder(out.parent)
     if out.suffix == WEIGHTS_SUFFIX:
         write_weights(read_checkpoint(find_checkpoint(str(cfg.ckpt_path))), out)
         print(f"{out}: weights of {loaded.name} for {loaded.task} in half precision, {out.stat().st_size / 1e6:.2f} MB")

@@ -19,9 +19,9 @@ from torchvision import tv_tensors
 
 import torchrefract
 from torchrefract import random
+from torchrefract._io import make_writable_folder
 from torchrefract._validation import UsageError, check_count, check_flag, check_number, first_names
 from torchrefract.cameras.camera import Camera
-from torchrefract.cli.command import Skipped, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.options import (
     check_seed,
     depth_folder,
@@ -32,6 +32,7 @@ from torchrefract.cli.options import (
     read_optional,
     read_place,
 )
+from torchrefract.cli.progress import Skipped, print_warning, progress, warn_of_assumed_depth
 from torchrefract.cli.robustness_runs import (
     FORMAT,
     REFERENCE_WIDTH,
@@ -148,7 +149,7 @@ def test_robustness(cfg: DictConfig) -> None:
             nn.ModuleList(effect for by in scenes(REFERENCE_WIDTH).values() for effect in by.values())
         )
     with naming("out"):
-        out.mkdir(parents=True, exist_ok=True)
+        make_writable_folder(out)
     with (
         locked("out", out),
         stored_scores(out / SCORES, settings, folder.path) as (done, store),

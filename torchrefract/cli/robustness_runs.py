@@ -18,8 +18,8 @@ import torchrefract
 from torchrefract import presets
 from torchrefract._io import CONFIG_DIR, write_file
 from torchrefract._validation import UsageError, first_names
-from torchrefract.cli.command import print_warning
 from torchrefract.cli.options import naming
+from torchrefract.cli.progress import print_warning
 from torchrefract.effects.base import Effect
 from torchrefract.robustness.evaluate import ImageScore, Level, Robustness, Scored
 from torchrefract.robustness.predictors import import_function

@@ -1,5 +1,6 @@
 """Draw a picture for each scene and effect: `python examples/gallery.py`, into examples/gallery and gallery.md."""
 
+import argparse
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -110,6 +111,7 @@ def _panel(image: Tensor, setting: Setting) -> Tensor:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     (FOLDER / "gallery").mkdir(exist_ok=True)
     text = HEAD
     for name in choices():

@@ -1,6 +1,7 @@
 """The rolling shutter of a camera that moves and vibrates."""
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -195,6 +196,10 @@ class RollingShutter(WarpEffect):
             depth=cast(DepthSource, self.depth),
             camera=self.camera,
         )
+
+    def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
+        """Return the plan for all parameters in the ranges, which counts the moments of the exposure."""
+        return replace(super().plan_for_dtype(height, width, dtype), num_samplings=len(self.moments()))
 
     def moments(self) -> list[float]:
         """Return the moments of the exposure that are averaged; its middle if there is none."""

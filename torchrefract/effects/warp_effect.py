@@ -137,7 +137,6 @@ class WarpEffect(Effect):
         if self.tolerance_px is None:
             request = replace(request, tolerance_px=None)
         plan = plan_warp(self.error_model() if request.tolerance_px else None, request)
-        plan = replace(plan, num_samplings=len(self.moments()))
         is_fine = 0 < plan.stride < _FINE_STRIDE and request.height * request.width >= _MIN_PIXELS
         if self.has_closed_form and not self.has_kinks and is_fine and request.tolerance_px is not None:
             plan = replace(plan, is_measured=True, error_px=request.tolerance_px)

@@ -8,4 +8,11 @@ from torchvision import tv_tensors
 
 def boxes_of(rows: Any, size: tuple[int, int]) -> tv_tensors.BoundingBoxes:
     """Return boxes (N, 4), x1, y1, x2, y2, of a frame of a size (height, width)."""
-    return tv_tensors.BoundingBoxes(torch.as_tensor(rows), format="XYXY", canvas_size=size)  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+    options: dict[str, Any] = {"format": "XYXY", "canvas_size": size}
+    return tv_tensors.BoundingBoxes(torch.as_tensor(rows), **options)
+
+
+def keypoints_of(rows: Any, size: tuple[int, int]) -> tv_tensors.KeyPoints:
+    """Return points (N, 2), x, y, of a frame of a size (height, width)."""
+    options: dict[str, Any] = {"canvas_size": size}
+    return tv_tensors.KeyPoints(torch.as_tensor(rows), **options)

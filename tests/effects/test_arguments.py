@@ -135,8 +135,9 @@ def test_every_range_ends_at_its_bounds(name):
         # Stronger physical turbulence is allowed, but too slow for other tests.
         is_exact = name != "physical turbulence" and math.isfinite(high)
         for wrong in (below, above) if is_exact else (below,) * (not argument.startswith("wind")):
+            options: dict[str, Any] = {argument: wrong}
             with pytest.raises(ValueError, match=f"^{argument} must"):
-                domain.kind(**{argument: wrong})  # pyright: ignore[reportArgumentType]  # one of its ranges
+                domain.kind(**options)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from targets import keypoints_of
 from torchvision import tv_tensors
 
 from torchrefract import Compose, LensDistortion, LensFlare, UniformFog
@@ -107,7 +108,7 @@ def test_other_layouts_and_types_raise(image, error, message):
 
 def test_labels_in_the_place_of_the_image_raise():
     mask = tv_tensors.Mask(torch.zeros(1, 48, 60, dtype=torch.uint8))
-    points = tv_tensors.KeyPoints(torch.rand(1, 3, 2), canvas_size=(48, 60))  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+    points = keypoints_of(torch.rand(1, 3, 2), (48, 60))
     for label in (mask, points):
         with pytest.raises(
             TypeError, match=rf"image must be an image, got {type(label).__name__} of torchvision; pass"

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import seeded
-from targets import boxes_of
+from targets import boxes_of, keypoints_of
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 from torchvision import tv_tensors
@@ -29,7 +29,7 @@ def sample() -> tuple[Tensor, dict]:
     target = {
         "boxes": boxes_of(boxes, size),
         "masks": tv_tensors.Mask(mask),
-        "points": tv_tensors.KeyPoints(torch.tensor([[40.0, 30.0], [70.0, 10.0]]), canvas_size=size),  # pyright: ignore[reportCallIssue]  # as above
+        "points": keypoints_of([[40.0, 30.0], [70.0, 10.0]], size),
         "labels": torch.tensor([3, 7]),
         "name": "frame 1",
     }

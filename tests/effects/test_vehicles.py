@@ -103,7 +103,8 @@ def test_dust_in_a_composition_takes_the_boxes_and_the_labels_move_along():
 @pytest.mark.quick
 def test_boxes_of_every_format_are_upright_boxes_from_the_center_of_the_first_pixel():
     for form, row in (("XYWH", [20.0, 14.0, 11.0, 9.0]), ("XYXYXYXY", [20.0, 14, 31, 14, 31, 23, 20, 23])):
-        target = tv_tensors.BoundingBoxes(torch.tensor([row]), format=form, canvas_size=(40, 60))  # pyright: ignore[reportCallIssue]  # torchvision's overloads
+        options: dict[str, Any] = {"format": form, "canvas_size": (40, 60)}
+        target = tv_tensors.BoundingBoxes(torch.tensor([row]), **options)
         assert_close(boxes_of_target([target], size=(40, 60)).boxes, torch.tensor([CAR]) - 0.5, rtol=0, atol=1e-5)
 
 

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
-from torchrefract.effects.base import Effect, check_kornia_keys
+from torchrefract.effects.base import Effect
+from torchrefract.effects.batch import check_kornia_keys
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.maps import warp_mask
 from torchrefract.labels.points import warp_points

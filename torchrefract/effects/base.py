@@ -1,6 +1,5 @@
 """The base class of all effects: parameters drawn by key, then a deterministic and differentiable degradation."""
 
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -29,6 +28,7 @@ from torchrefract.effects.batch import (
     check_frames,
     check_image,
     check_image_values,
+    check_kornia_keys,
     first_frames,
     fix_frame_size,
     frame_numbers,
@@ -77,7 +77,6 @@ class Effect(nn.Module, ABC):
 
     params_type: type[Any]
     labels_getter: str | Callable[[Any], Any] | None = "default"
-    keeps_uint8: bool = False  # whether `degrade_batch` accepts uint8 images as they are
     depth: DepthSource | None = None  # of frames without a depth map; None for an effect that depends on no depth
 
     def __init__(self, *, p: float = 1.0):
@@ -276,6 +275,11 @@ class Effect(nn.Module, ABC):
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> Any:
         """Return the plan for flows or maps of a type, from the ranges alone."""
 
+    @property
+    def keeps_uint8(self) -> bool:
+        """Return True if `degrade_batch` accepts uint8 images as they are."""
+        return False
+
     @abstractmethod
     def sample_params(self, stream: random.Stream, image: Tensor) -> Any:
         """Draw parameters for images (B, C, H, W) from the random streams of the samples; a `frame` is 0."""
@@ -380,24 +384,6 @@ class Effect(nn.Module, ABC):
             result = self.degrade_batch(batch, params, depth)
         result.image = from_batch(result.image, image, batch)
         return result if image.ndim == 4 and not shape.is_clip else result.map(shape.restore)
-
-
-def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container") -> None:
-    """Raise TypeError inside a container of kornia that passes labels, which it would not move."""
-    operations = sys.modules.get("kornia.augmentation.container.ops")
-    if operations is None or torch.compiler.is_compiling():
-        return
-    # A container calls foreign modules with the image alone; its data keys are in its own frame only.
-    frame = sys._getframe(1)
-    while frame is not None:
-        keys = frame.f_locals.get("_data_keys", ()) if frame.f_globals is vars(operations) else ()
-        names = [key.name.lower() for key in keys if key.name not in ("IMAGE", "INPUT", "CLASS", "LABEL")]
-        if names:
-            raise TypeError(
-                f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
-                + remedy
-            )
-        frame = frame.f_back
 
 
 def _find_image(leaves: list[Any], names: list[str]) -> int:

@@ -297,6 +297,24 @@ def select_params(params: Any, index: Tensor) -> Any:
     return map_params(params, lambda value: value[index])
 
 
+def check_kornia_keys(remedy: str = "pass torchrefract.adapters.kornia.KorniaEffect(effect) to the container") -> None:
+    """Raise TypeError inside a container of kornia that passes labels, which it would not move."""
+    operations = sys.modules.get("kornia.augmentation.container.ops")
+    if operations is None or torch.compiler.is_compiling():
+        return
+    # A container calls foreign modules with the image alone; its data keys are in its own frame only.
+    frame = sys._getframe(1)
+    while frame is not None:
+        keys = frame.f_locals.get("_data_keys", ()) if frame.f_globals is vars(operations) else ()
+        names = [key.name.lower() for key in keys if key.name not in ("IMAGE", "INPUT", "CLASS", "LABEL")]
+        if names:
+            raise TypeError(
+                f"data_keys must be ['input'] for an effect as it is, got {names} too, which kornia would not move; "
+                + remedy
+            )
+        frame = frame.f_back
+
+
 def rows_of_samples(index: Tensor, frames: int) -> Tensor:
     """Return (n T,), the rows of some samples, (n,), of T frames each."""
     return (frames * index[:, None] + torch.arange(frames, device=index.device)).flatten()

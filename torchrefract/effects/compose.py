@@ -88,7 +88,7 @@ class Compose(Effect):
         self.tolerance_px = check_tolerance(tolerance_px)
 
     @property
-    def keeps_uint8(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # follows from the effects
+    def keeps_uint8(self) -> bool:
         """Return True if all effects do."""
         return all(effect.keeps_uint8 for effect in self.effects)
 

@@ -69,7 +69,6 @@ class WarpEffect(Effect):
         p: probability that a sample is degraded.
     """
 
-    keeps_uint8 = True  # sampling rounds its result
     rounding_ulps = DEFAULT_ULPS
     has_closed_form = False  # whether `flow` computes any points, not only the nodes of a lattice
     has_kinks = False  # whether the lattice follows from error bounds alone, since measurements miss kinks
@@ -123,6 +122,11 @@ class WarpEffect(Effect):
         A warp with several of them has a `depth`.
         """
         return [0.0]
+
+    @property
+    def keeps_uint8(self) -> bool:
+        """Return True: sampling rounds its result."""
+        return True
 
     def plan_for_dtype(self, height: int, width: int, dtype: torch.dtype) -> WarpPlan:
         """Return the plan for all parameters in the ranges."""

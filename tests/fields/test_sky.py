@@ -121,6 +121,17 @@ def test_haze_at_the_horizon_and_sky_behind_poles_belong_to_the_sky():
     assert (sky_mask(frame) == actual).float().mean() > 0.999
 
 
+def test_smooth_concrete_and_a_road_in_haze_below_a_white_sky_are_not_sky():
+    frame, expected = painted((0.95, 0.95, 0.95))
+    frame[..., :40, 100:130], expected[..., :40, 100:130] = 0.6, False  # a viaduct from below
+    assert not (sky_mask(frame) & ~expected).any()
+    # White haze, without an edge between the sky and the road, which is as bright as a gray sky.
+    frame[..., :, 130:] = torch.linspace(1, 0.55, HEIGHT)[:, None]
+    actual = sky_mask(frame)[0, 0, :, 132:158]
+    assert actual[:30].all()
+    assert not actual[70:].any()
+
+
 @pytest.mark.quick
 def test_a_frame_that_was_written_to_has_a_sky_of_its_new_values():
     frame = torch.full((1, 3, HEIGHT, WIDTH), 0.2)

@@ -17,6 +17,7 @@ _MAX_RANGE = 0.06  # of the luma in a smooth neighborhood of three by three node
 _MIN_LUMA, _ABOVE_MEDIAN = 0.5, 0.05  # of a gray or white sky; streets at night and most roads are darker
 _MIN_BLUE, _MIN_BLUE_LUMA = 0.1, 0.3  # blue minus red, and luma, of a blue sky
 _MIN_CONTRAST = 0.15  # of the mean luma of a gray or white sky to that of the rest; that of a road is below 0.1
+_MAX_SHADE = 0.25  # of the luma of a gray or white sky, below its mean
 _MIN_SHARE = 0.02  # of the frame
 _MIN_BLUE_SHARE = 0.05  # of the sky; below, the blue is glass that mirrors it
 _MAX_NIGHT_LUMA, _MIN_NIGHT_SHARE = 0.3, 0.05  # of a sky at night
@@ -74,7 +75,8 @@ def sky_mask(image: Tensor) -> Tensor:
     lies within 0.06, and if its luma is above 0.5 and 0.05 above the median, or if blue exceeds red by 0.1 and the luma
     0.3. The candidates that are connected to the top row are the sky, if they cover 2 % of the frame and are blue or,
     in the mean, 0.15 brighter than the rest. So a road seen from above, a frame at night and a frame without sky have
-    none. Three times, smooth nodes at most 7 nodes from the sky join it: those that differ from it there by less than
+    none. Nodes that are not blue, and darker than the mean of the sky by 0.25, are left out: concrete, or a road in
+    haze. Three times, smooth nodes at most 7 nodes from the sky join it: those that differ from it there by less than
     0.06 in each channel, which finds the haze at the horizon, and sky that poles cut off; and, if 5 % of the sky are
     blue, those of a paler blue, which finds blue sky that clouds cut off. A pixel at these nodes, next to them, or
     above them in its column is then sky unless one of its channels is darker by 0.12 than the sky around it: this
@@ -90,7 +92,7 @@ def sky_mask(image: Tensor) -> Tensor:
     image = image.detach()
     mask, stride, _ = find_sky(image)
     nodes = _nodes(image, stride)
-    is_smooth, is_pale = _is_smooth(luma(nodes)), _is_pale(nodes, mask)
+    is_smooth, is_pale = _is_smooth(luma(nodes)) & ~_is_shaded(nodes, mask), _is_pale(nodes, mask)
     for _ in range(_GROWTHS):
         nearby, is_near = _mean_nearby(mask, nodes)
         is_equal = (nodes - nearby).abs().amax(dim=1, keepdim=True) < _MAX_DIFFERENCE
@@ -121,7 +123,7 @@ def find_sky(image: Tensor) -> Sky:
     is_sky = (contrast > _MIN_CONTRAST) | (_mean_where(sky, blue) > _MIN_BLUE)
     is_sky = is_sky & (_share(sky) >= _MIN_SHARE)
     dark = _connected_to_top(is_smooth & (y < _MAX_NIGHT_LUMA))
-    return Sky(sky & is_sky, stride, (~is_sky & (_share(dark) > _MIN_NIGHT_SHARE)).view(-1))
+    return Sky(sky & is_sky & ~_is_shaded(nodes, sky), stride, (~is_sky & (_share(dark) > _MIN_NIGHT_SHARE)).view(-1))
 
 
 def is_day(image: Tensor) -> Tensor:
@@ -167,6 +169,12 @@ def _nodes(image: Tensor, stride: int) -> Tensor:
 def _blue(nodes: Tensor) -> Tensor:
     """Return blue minus red, (N, 1, h, w), and 0 for an image that has no three channels."""
     return nodes[:, 2:] - nodes[:, :1] if nodes.shape[1] == 3 else torch.zeros_like(nodes[:, :1])
+
+
+def _is_shaded(nodes: Tensor, sky: Tensor) -> Tensor:
+    """Return the nodes that are not blue and darker than clouds in the sky, as concrete and roads are."""
+    y = luma(nodes)
+    return (y < _mean_where(sky, y) - _MAX_SHADE) & (_blue(nodes) < _MIN_BLUE)
 
 
 def _is_pale(nodes: Tensor, sky: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from array import array
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from safetensors.numpy import load_file
 from torchrefract import presets, warp
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import read_image
+from torchrefract.data.pairs import card
 
 COUNT = 10
 
@@ -169,6 +171,29 @@ def test_the_card_has_counts_and_the_license(refractive, rows):
     for name in {row["effects"][0]["effect"] for row in listed}:
         assert f"| {name} | {sum(row['effects'][0]['effect'] == name for row in listed)} |" in card
     assert np.asarray(Image.open(refractive / "parameters.png")).std() > 10
+
+
+def test_histograms_name_the_components_and_the_unit_of_a_parameter():
+    parameters = {
+        ("HeterogeneousFog", "airlight"): 3,
+        ("HeterogeneousFog", "scale_height"): 1,
+        ("LensDistortion", "center"): 2,
+        ("RollingShutter", "amplitude"): 3,
+        ("RollingShutter", "frequency"): 3,
+        ("RollingShutter", "phase"): 9,
+        ("Turbulence", "amplitude"): 1,
+    }
+    columns = {name: [array("d", [0.0, 1.0])] * count for name, count in parameters.items()}
+    summary = card.summarize([], settings={"scene": {}})._replace(parameters=columns)
+    assert [label for _, label, _ in card.histogram_panels(summary)] == [
+        *("airlight red", "airlight green", "airlight blue", "scale_height, m", "center x", "center y"),
+        *("amplitude pitch, degrees", "amplitude yaw, degrees", "amplitude roll, degrees"),
+        *("frequency 1, Hz", "frequency 2, Hz", "frequency 3, Hz", "phase, rad, all components", "amplitude, px"),
+    ]
+    few = summary._replace(parameters={("Turbulence", "amplitude"): [array("d", [0.0, 1.0])]})
+    figure = card.draw_histograms(few)
+    assert figure is not None
+    assert Image.open(io.BytesIO(figure)).size == (320, 230)
 
 
 @pytest.mark.parametrize("license_of", ["CC BY 4.0, MIT (two sources)", "the owner's: ask [us]", "'in quotes, too'"])

@@ -4,7 +4,7 @@ import io
 import math
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,8 +38,20 @@ _FORMATS = {
 _FORMATS["maps.safetensors"] = _FORMATS["maps.npz"].replace("NumPy arrays", "tensors")
 _COLUMNS, _MAX_BINS = 4, 30
 _AXES = ("x", "y", "z")
-_UNITS = {"amplitude": "px", "length": "px", "aperture": "px", "displacement": "px", "visibility": "m"}
-_UNITS |= {"focal": "image widths", "radius": "image diagonals"}
+_COLORS = ("red", "green", "blue")
+# By the name of a parameter, or by that of its effect and its own.
+_COMPONENTS: dict[str | tuple[str, str], Sequence[str]] = {
+    "airlight": _COLORS,
+    "color": _COLORS,
+    "frequency": ("1", "2", "3"),
+    ("RollingShutter", "amplitude"): ("pitch", "yaw", "roll"),
+    ("ChromaticAberration", "scale"): ("red", "blue"),
+}
+_UNITS: dict[str | tuple[str, str], str] = dict.fromkeys(("amplitude", "length", "aperture", "displacement"), "px")
+_UNITS |= {"focal": "image widths", "radius": "image diagonals", "visibility": "m", "scale_height": "m"}
+_UNITS |= {"speed": "km/h", "readout": "ms", "exposure": "ms", "frequency": "Hz", "rate": "Hz", "phase": "rad"}
+_UNITS |= {("RollingShutter", "amplitude"): "degrees", ("SunGlare", "scale"): "degrees", "difference": "K"}
+_UNITS |= {"wave": "cycles per image width", "tilt": "microradians"}
 
 
 class Summary(NamedTuple):
@@ -138,20 +150,21 @@ def draw_histograms(summary: Summary) -> bytes | None:
     """Draw a histogram of each parameter that varies; return a PNG, or None if none varies."""
     from matplotlib.figure import Figure  # noqa: PLC0415  # workers import this module and draw nothing
 
-    panels = list(_histogram_panels(summary))
+    panels = list(histogram_panels(summary))
     if not panels:
         return None
-    rows = -(-len(panels) // _COLUMNS)
-    width, height = 3.2 * _COLUMNS, 2.3 * rows
+    columns = min(len(panels), _COLUMNS)
+    rows = -(-len(panels) // columns)
+    width, height = 3.2 * columns, 2.3 * rows
     figure = Figure(figsize=(width, height), dpi=100)
     # Margins in inches keep all panels of the same size.
     figure.subplots_adjust(0.6 / width, 0.5 / height, 1 - 0.15 / width, 1 - 0.3 / height, wspace=0.25, hspace=0.55)
     for i, (title, label, values) in enumerate(panels):
-        axes = figure.add_subplot(rows, _COLUMNS, i + 1)
+        axes = figure.add_subplot(rows, columns, i + 1)
         axes.hist(values, bins=min(_MAX_BINS, math.isqrt(len(values)) + 1), color="tab:blue", edgecolor="white")
         axes.set_title(title, fontsize=9)
         axes.set_xlabel(label, fontsize=8)
-        axes.set_ylabel("count" if i % _COLUMNS == 0 else "", fontsize=8)
+        axes.set_ylabel("count" if i % columns == 0 else "", fontsize=8)
         axes.tick_params(labelsize=7)
         axes.locator_params(axis="x", nbins=4)
         axes.locator_params(axis="y", nbins=4, integer=True)
@@ -160,19 +173,21 @@ def draw_histograms(summary: Summary) -> bytes | None:
     return stream.getvalue()
 
 
-def _histogram_panels(summary: Summary) -> Iterable[tuple[str, str, np.ndarray]]:
+def histogram_panels(summary: Summary) -> Iterable[tuple[str, str, np.ndarray]]:
     """Yield title, label and values of each parameter that varies; many components share one panel."""
     for (effect, name), columns in sorted(summary.parameters.items()):
         arrays = [np.frombuffer(column) for column in columns]
         varied = {i: column for i, column in enumerate(arrays) if np.isfinite(column).all() and np.ptp(column) > 0}
-        unit = f", {_UNITS[name]}" if name in _UNITS else ""
+        unit = _UNITS.get((effect, name), _UNITS.get(name))
+        unit = "" if unit is None else f", {unit}"
+        components = _COMPONENTS.get((effect, name), _COMPONENTS.get(name, _AXES))
         if name == "coefficients" and len(arrays) == len(POLYNOMIAL12):
             yield from ((effect, POLYNOMIAL12[i], column) for i, column in varied.items())
         elif len(arrays) > len(_AXES) and varied:
             yield effect, f"{name}{unit}, all components", np.concatenate(list(varied.values()))
         else:
             for i, column in varied.items():
-                yield effect, f"{name}{f' {_AXES[i]}' if len(arrays) > 1 else ''}{unit}", column
+                yield effect, f"{name}{f' {components[i]}' if len(arrays) > 1 else ''}{unit}", column
 
 
 class PairTable:

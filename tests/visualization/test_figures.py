@@ -222,6 +222,12 @@ def test_parameters_are_described_with_their_units(frame, effect, description):
     assert re.fullmatch(description, describe_params(effect, effect.sample(frame, seed=0)))
 
 
+def test_a_tilt_of_hundreds_of_microradians_is_written_without_an_exponent(frame):
+    effect = tr.PhysicalTurbulence()
+    params = effect.sample(frame, seed=0)._replace(tilt=torch.tensor([739.4]))
+    assert describe_params(effect, params).startswith("tilt 739 microradians, wind")
+
+
 def test_a_contact_sheet_shows_its_rows_in_order_each_with_its_own_scale(frame):
     rows = [contact_sheet_row(name, e, frame=frame, seed=5) for name, e in (("a", WARP), ("b", FOLDING_WARP))]
     figure = contact_sheet(rows, title="frame.png, 40 x 32 px")

@@ -59,7 +59,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
     "readout": lambda value: f"readout {value:.3g} ms",
     "vibration": lambda value: f"vibration {value.abs().max():.2g} deg",
     "difference": lambda value: f"road {value:.2g} K hotter",
-    "tilt": lambda value: f"tilt {value:.2g} microradians",
+    "tilt": lambda value: f"tilt {value:.3g} microradians",
     "ratio": lambda value: f"D / r0 {value:.2g}",
     "scale": lambda value: (
         f"red {value[0]:.2g}, blue {value[-1]:.2g} larger" if value.ndim else f"scale {value:.2g} deg"

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrefract.data.images import read_image
-from torchrefract.fields.sky import sky_mask
+from torchrefract.fields.sky import find_sky, sky_mask
 
 HEIGHT, WIDTH = 90, 160
 
@@ -119,6 +119,18 @@ def test_haze_at_the_horizon_and_sky_behind_poles_belong_to_the_sky():
     assert (actual & expected)[..., 33:39, :].sum() > 0.9 * expected[..., 33:39, :].sum()
     frame[..., 5, 100] = torch.nan
     assert (sky_mask(frame) == actual).float().mean() > 0.999
+
+
+@pytest.mark.parametrize("rows", [1, 2, 15])
+def test_a_black_line_or_bar_above_the_frame_does_not_hide_the_sky(rows):
+    frame, expected = painted()
+    padded = torch.nn.functional.pad(frame, (0, 0, rows, 0))
+    padded[:, :, rows - 1] += 0.02 * torch.rand(3, WIDTH, generator=torch.Generator().manual_seed(4))  # compressed
+    actual = sky_mask(padded)
+    assert not actual[:, :, :rows].any()
+    assert (actual[:, :, rows:] != sky_mask(frame)).float().mean() < 0.02
+    assert (actual[:, :, rows:] & expected).sum() > 0.9 * expected.sum()
+    assert not find_sky(padded).nodes[:, :, :rows].any()
 
 
 def test_smooth_concrete_and_a_road_in_haze_below_a_white_sky_are_not_sky():

@@ -22,6 +22,7 @@ _MIN_SHARE = 0.02  # of the frame
 _MIN_BLUE_SHARE = 0.05  # of the sky; below, the blue is glass that mirrors it
 _MAX_NIGHT_LUMA, _MIN_NIGHT_SHARE = 0.3, 0.05  # of a sky at night
 _MIN_DAY_LUMA, _MIN_DAY_SHARE = 0.35, 0.1  # of the upper third by day, and of smooth nodes above the luma of the night
+_BLACK, _MAX_BAR = 0.06, 0.17  # of a bar or line above a frame, largest value, and share of the height
 _AROUND, _MAX_DARKER = 15, 0.12  # nodes, and difference of a channel, from the color of the sky around a pixel
 _GROWTHS, _MAX_DIFFERENCE = 3, 0.06  # steps, and difference of a channel, from the sky around to more of it
 _SWEEPS = 3  # each goes around one corner
@@ -71,16 +72,16 @@ def _keep_latest(function: _F) -> _F:
 def sky_mask(image: Tensor) -> Tensor:
     """Return the pixels that show the sky: connected to the top row, smooth, and bright or blue.
 
-    The frame is judged at the nodes of a lattice. A node is a candidate if the luma of its eight neighbors and itself
-    lies within 0.06, and if its luma is above 0.5 and 0.05 above the median, or if blue exceeds red by 0.1 and the luma
-    0.3. The candidates that are connected to the top row are the sky, if they cover 2 % of the frame and are blue or,
-    in the mean, 0.15 brighter than the rest. So a road seen from above, a frame at night and a frame without sky have
-    none. Nodes that are not blue, and darker than the mean of the sky by 0.25, are left out: concrete, or a road in
-    haze. Three times, smooth nodes at most 7 nodes from the sky join it: those that differ from it there by less than
-    0.06 in each channel, which finds the haze at the horizon, and sky that poles cut off; and, if 5 % of the sky are
-    blue, those of a paler blue, which finds blue sky that clouds cut off. A pixel at these nodes, next to them, or
-    above them in its column is then sky unless one of its channels is darker by 0.12 than the sky around it: this
-    follows trees and poles, and fills clouds.
+    The frame, below a black bar if there is one, is judged at the nodes of a lattice. A node is a candidate if the luma
+    of its eight neighbors and itself lies within 0.06, and if its luma is above 0.5 and 0.05 above the median, or if
+    blue exceeds red by 0.1 and the luma 0.3. The candidates that are connected to the top row are the sky, if they
+    cover 2 % of the frame and are blue or, in the mean, 0.15 brighter than the rest. So a road seen from above, a frame
+    at night and a frame without sky have none. Nodes that are not blue, and darker than the mean of the sky by 0.25,
+    are left out: concrete, or a road in haze. Three times, smooth nodes at most 7 nodes from the sky join it: those
+    that differ from it there by less than 0.06 in each channel, which finds the haze at the horizon, and sky that poles
+    cut off; and, if 5 % of the sky are blue, those of a paler blue, which finds blue sky that clouds cut off. A pixel
+    at these nodes, next to them, or above them in its column is then sky unless one of its channels is darker by 0.12
+    than the sky around it: this follows trees and poles, and fills clouds.
 
     Args:
         image: (N, C, H, W), stored values (sRGB) in [0, 1], or uint8. Three channels are red, green and blue; other
@@ -91,7 +92,7 @@ def sky_mask(image: Tensor) -> Tensor:
     """
     image = image.detach()
     mask, stride, _ = find_sky(image)
-    nodes = _nodes(image, stride)
+    nodes = _without_bar(_nodes(image, stride))
     is_smooth, is_pale = _is_smooth(luma(nodes)) & ~_is_shaded(nodes, mask), _is_pale(nodes, mask)
     for _ in range(_GROWTHS):
         nearby, is_near = _mean_nearby(mask, nodes)
@@ -112,7 +113,8 @@ def sky_mask(image: Tensor) -> Tensor:
 def find_sky(image: Tensor) -> Sky:
     """Return the sky at the nodes of a lattice, before smooth nodes around join it; see `sky_mask`."""
     stride = max(1, max(image.shape[2:]) // _NODES)
-    nodes = _nodes(image.detach(), stride)
+    shown = _nodes(image.detach(), stride)
+    nodes = _without_bar(shown)
     y = luma(nodes)
     blue = _blue(nodes)
     is_smooth = _is_smooth(y)
@@ -123,7 +125,8 @@ def find_sky(image: Tensor) -> Sky:
     is_sky = (contrast > _MIN_CONTRAST) | (_mean_where(sky, blue) > _MIN_BLUE)
     is_sky = is_sky & (_share(sky) >= _MIN_SHARE)
     dark = _connected_to_top(is_smooth & (y < _MAX_NIGHT_LUMA))
-    return Sky(sky & is_sky & ~_is_shaded(nodes, sky), stride, (~is_sky & (_share(dark) > _MIN_NIGHT_SHARE)).view(-1))
+    is_sky_node = sky & is_sky & ~_is_shaded(nodes, sky) & (shown.amax(dim=1, keepdim=True) > _BLACK)
+    return Sky(is_sky_node, stride, (~is_sky & (_share(dark) > _MIN_NIGHT_SHARE)).view(-1))
 
 
 def is_day(image: Tensor) -> Tensor:
@@ -164,6 +167,15 @@ def _nodes(image: Tensor, stride: int) -> Tensor:
     nodes = image[:, :, ::stride, ::stride]
     nodes = nodes.float() / 255 if image.dtype is torch.uint8 else nodes.float()
     return nodes.contiguous().nan_to_num(nan=0.0).clamp(0, 1)
+
+
+def _without_bar(nodes: Tensor) -> Tensor:
+    """Continue the nodes below a black bar at the top, up to a sixth of the height, over the bar and its rim."""
+    height = nodes.shape[2]
+    first = (nodes.amax(dim=(1, 3)) > _BLACK).to(torch.uint8).argmax(dim=1)  # 0 if all rows are black
+    first = torch.where((first > 0) & (first < _MAX_BAR * height), first + 1, 0)
+    row = torch.arange(height, device=nodes.device).maximum(first[:, None])
+    return nodes.gather(2, row[:, None, :, None].expand_as(nodes))
 
 
 def _blue(nodes: Tensor) -> Tensor:

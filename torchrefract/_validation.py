@@ -109,6 +109,11 @@ def first_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + more
 
 
+def type_name(value: object) -> str:
+    """Return the name of a value's type, for a message; "the class X" for a class in the place of an instance."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
 def check_tensor(name: str, value: Tensor) -> Tensor:
     """Return `value` if it is a tensor."""
     if not isinstance(value, Tensor):

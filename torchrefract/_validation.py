@@ -243,7 +243,8 @@ def _has_memory(value: Tensor) -> bool:
 def _check_real(name: str, value: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | numbers.Real):
         raise TypeError(f"{name} must be a real number, got {value!r}")
-    if math.isnan(value):
+    # math.isnan breaks a graph in which torch.compile makes symbols of numbers that differ from an earlier effect's.
+    if not -math.inf <= value <= math.inf:
         raise ValueError(f"{name} must not be NaN, got {value}")
     # Small NumPy types cannot be compared with large bounds.
     return value if isinstance(value, int | float) else float(value)

@@ -94,7 +94,7 @@ class Effect(nn.Module, ABC):
 
         `effect(image)`, `effect(image, target)`, `effect(image, boxes, labels)` and one sample, a dict, list or tuple
         with the image in it, work as in torchvision's transforms. The image of a sample is its torchvision `Image` or
-        `Video` or, if it has neither, its first plain tensor.
+        `Video` or, if it has neither, its first plain tensor. A list of images raises ValueError.
 
         Args:
             image: as for the class, or a sample.

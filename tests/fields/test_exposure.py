@@ -19,6 +19,7 @@ from torchrefract.fields.exposure import (
     metered_nodes,
     sensor_noise,
 )
+from torchrefract.fields.srgb import linear_to_srgb, srgb_to_linear
 
 
 @pytest.mark.quick
@@ -109,6 +110,13 @@ def test_clipped_light_stays_white_and_other_light_gets_the_gain():
     assert exposed[4].item() == pytest.approx(1)
     light[:, 0] = 0.1  # a saturated color is no clipped light
     assert_close(expose_clipped(light, gain), 0.25 * light)
+
+
+def test_white_that_a_jpeg_blurs_by_a_few_levels_stays_even_under_a_low_gain():
+    stored = torch.arange(248.0, 256.0) / 255
+    light = srgb_to_linear(stored).view(1, 1, 1, 8).expand(1, 3, 1, 8)
+    exposed = linear_to_srgb(expose_clipped(light, torch.full((1, 1, 1, 1), 0.05)))[0, 0, 0]
+    assert_close(exposed, stored, rtol=0, atol=2 / 255)
 
 
 def test_gradients_match_finite_differences():

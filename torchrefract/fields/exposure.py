@@ -12,7 +12,7 @@ from torchrefract.fields.srgb import LINEAR_TOE, STORED_TOE, linear_to_srgb, srg
 
 _NODES = 192  # of the metered lattice along the longer side
 _CEILING = 16.0  # times white; brighter light counts as this, since a sensor saturates
-_CLIPPED = 0.8  # linear light, from where a frame may be clipped
+_CLIPPED = (0.8, 0.95)  # linear light, from where a frame may be clipped, and is: JPEG blurs white by a few levels
 _DARK = 1e-3  # added to both sides of a ratio of means, so that black frames have a gain
 _SHORTEST = 1e-3  # frames, of a time constant
 _CACHED_VALUES = 1 << 18  # float32 values; half as many take as long, with more starts of operations
@@ -104,7 +104,7 @@ def apply_gain(image: Tensor, gain: Tensor) -> Tensor:
 
 
 def expose_clipped(light: Tensor, gain: Tensor) -> Tensor:
-    """Return G x + (1 - G) w x for G below 1, where w rises from 0 to 1 as the darkest channel rises from 0.8 to 1.
+    """Return G x + (1 - G) w x for G below 1, w = s^2 (3 - 2 s), s = (darkest channel - 0.8) / 0.15 within [0, 1].
 
     White in a frame is light that its camera clipped, and so brighter by an unknown factor: it stays white under a
     lower gain, where G x alone would turn an overcast sky into a gray plane.
@@ -113,7 +113,9 @@ def expose_clipped(light: Tensor, gain: Tensor) -> Tensor:
         light: (N, C, H, W), x, linear light in [0, 1].
         gain: (N, 1, 1, 1), G.
     """
-    clipped = (light.amin(dim=1, keepdim=True) - _CLIPPED).mul_(1 / (1 - _CLIPPED)).clamp(0, 1).square()
+    low, high = _CLIPPED
+    clipped = (light.amin(dim=1, keepdim=True) - low).mul_(1 / (high - low)).clamp(0, 1)
+    clipped = clipped * clipped * (3 - 2 * clipped)
     return light * torch.addcmul(gain, 1 - gain, clipped)
 
 

@@ -64,6 +64,17 @@ def test_a_constant_gain_restores_what_fog_left(t):
     assert_close(foggy + model(foggy), fog_of_all + (foggy - fog_of_all) / t)
 
 
+@pytest.mark.quick
+@pytest.mark.parametrize("light", [(0.8, 0.9, 1.0), (1.0, 0.9, 0.8), (0.5, 0.5, 0.5)])
+def test_the_color_of_the_light_and_the_exposure_pass_through(light):
+    model, image, gain = build(4), 0.3 * picture(), torch.tensor(light)[:, None, None]
+    image[:, :, : SIZE[0] // 2] = 0.9  # fog, which gives the airlight
+    change, transmission = model(image).split([3, 1], dim=1)
+    of_other_light = model(gain * image)
+    assert change.abs().max() > 0.05
+    assert_close(of_other_light, torch.cat([gain * change, transmission], dim=1), rtol=0, atol=1e-3)
+
+
 def test_every_weight_and_the_image_have_a_gradient():
     model, image = build().train(), picture().requires_grad_()
     model(image).square().sum().backward()

@@ -10,21 +10,23 @@ from torchrefract.restoration.models.coordconv import pixel_coordinates
 from torchrefract.warping.grid import field_dtype
 
 _STRIDE = 32
-_INPUTS = 9
+_INPUTS = 6
 _WIDTHS = (1, 2, 4, 6, 6)  # of the scales, in multiples of the width
 _SHARPNESS = 50.0  # of the weights of the airlight, per unit of the dark channel
 _LEVEL = 1 / 255
+_DARKEST = 0.05  # airlight, below which an image is not brightened further for the network
 _MAX_LOG_GAIN = 4.0  # beyond, 8 bits hold little of the scene
 
 
 class FogNet(nn.Module):
     """Predict maps of foggy images by a small U-Net that is given the airlight.
 
-    Fog adds A (1 - t) and leaves t (J - A) of the scene J, so that log |I - A| falls with the distance as log t does.
-    The inputs are I - A, A as of `airlight_in_fog`, the logarithm, and the coordinates of the pixels. The mean of the
-    coarsest features, which tells how dense the fog is, is added to all of them. The first three maps, the change of
-    the image, are (I - A) (exp(g) - 1) + r with g and r of the last layer, which starts at zero: exp(g) takes the part
-    of 1 / t, so that details come from the image.
+    Fog adds A (1 - t) and leaves t (J - A) of the scene J. In units of the airlight A, as of `airlight_in_fog`, it is
+    D = I / A - 1, whatever the color and the exposure of the camera, and log |D| falls with the distance as log t does.
+    The inputs are D, the logarithm, and the coordinates of the pixels. The mean of the coarsest features, which tells
+    how dense the fog is, is added to all of them. The first three maps, the change of the image, are
+    A (D (exp(g) - 1) + r) with g and r of the last layer, which starts at zero: exp(g) takes the part of 1 / t, so that
+    details come from the image.
 
     Args:
         channels: number of maps to predict, at least the three of the change.
@@ -63,10 +65,10 @@ class FogNet(nn.Module):
         """
         check_rgb("image", image)
         height, width = image.shape[2:]
-        airlight = airlight_in_fog(image)[:, :, None, None]
-        difference = image - airlight
+        airlight = airlight_in_fog(image)[:, :, None, None].clamp(min=_DARKEST)
+        difference = image / airlight - 1
         logarithm = (difference.abs().amax(dim=1, keepdim=True) + _LEVEL).log()
-        parts = [4 * difference, 4 * airlight.expand_as(image) - 2, logarithm / 2 + 1, pixel_coordinates(image)]
+        parts = [4 * difference, logarithm / 2 + 1, pixel_coordinates(image)]
         inputs = pad_to_multiple(torch.cat(parts, dim=1), _STRIDE).contiguous(memory_format=torch.channels_last)
         scales = [inputs]
         for layer in self.down:
@@ -77,8 +79,8 @@ class FogNet(nn.Module):
             features = F.interpolate(features, scale_factor=2, mode="bilinear")
             features = layer(torch.cat([features, scales.pop()], dim=1))
         log_gain, maps = self.head(features)[:, :, :height, :width].split([1, self.head.out_channels - 1], dim=1)
-        change = difference * torch.expm1(log_gain.clamp(max=_MAX_LOG_GAIN))
-        return torch.cat([maps[:, :3] + change, maps[:, 3:]], dim=1)
+        change = difference * torch.expm1(log_gain.clamp(max=_MAX_LOG_GAIN)) + maps[:, :3]
+        return torch.cat([airlight * change, maps[:, 3:]], dim=1)
 
 
 def airlight_in_fog(image: Tensor) -> Tensor:

@@ -198,11 +198,10 @@ def test_a_picture_is_degraded_as_displayed_and_keeps_16_bits(call, tmp_path):
     save_picture(tmp_path / "raw" / "deep.png", smooth_picture().astype(np.uint16) * 257)
     save_turned(tmp_path / "raw" / "phone.png", smooth_picture(), 6)
     assert call("degrade", *WORDS).code == 0
-    for name in ("phone.png", "deep.png"):
+    for name, shape, bits in (("phone.png", (3, 96, 48), 8), ("deep.png", (3, 48, 96), 16)):
         expected = degraded(tmp_path, name, presets.cheap_dashcam(4)).image[0]
-        bits = 16 if name == "deep.png" else 8
+        assert expected.shape == shape
         assert (read_image(tmp_path / "out" / name) - expected).abs().max() < 0.51 / (2**bits - 1) + 1e-5
-    assert expected.shape == (3, 48, 96)
 
 
 def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, folder):

@@ -220,7 +220,7 @@ def _print_failures(result: Robustness) -> None:
 def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
     for scene in result.scenes:
         if scene in result.quantities:
-            print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+            print(f"{scene}: {format_tolerated(result, scene, loss=loss)}")
         else:
             print(
                 f"{scene}: mean score {result.mean_performance(scene):.3f}; it has no quantity that could be tolerated"

@@ -25,7 +25,7 @@ from pictures import (
 from processes import running, wait_for
 from pycocotools.coco import COCO
 
-from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
+from torchrefract import __version__, key_of, presets, warp, warp_boxes, warp_mask
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
@@ -67,6 +67,21 @@ def test_pictures_keep_their_names_and_are_drawn_by_them(call, folder):
     (folder / "raw" / "a.png").unlink()
     assert call("degrade", *WORDS, "seed=5", "out=more").code == 0
     assert (folder / "more" / NAMES[1]).read_bytes() == (folder / "out" / NAMES[1]).read_bytes()
+
+
+def test_a_folder_of_another_version_is_continued_with_a_warning(call, folder):
+    (folder / "raw" / NAMES[1]).rename(folder / "b.png")
+    assert call("degrade", *WORDS).code == 0
+    path = folder / "out" / "config.json"
+    config = json.loads(path.read_text())
+    expected = {"torchrefract": __version__, "torch": torch.__version__, "numpy": np.__version__}
+    assert config["made_with"] == expected | {"opencv": cv2.__version__}
+    path.write_text(json.dumps(config | {"made_with": expected | {"torchrefract": "0.0"}}))
+    (folder / "b.png").rename(folder / "raw" / NAMES[1])
+    outcome = call("degrade", *WORDS)
+    assert outcome.out.startswith("out: 1 degraded, 2 already existed")
+    assert outcome.err.startswith("warning: the files in out were made with torchrefract 0.0, torch ")
+    assert call("degrade", *WORDS).err == ""
 
 
 def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder):

@@ -16,13 +16,13 @@ from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
+from torchrefract.cli.options import claim_out, find_device, make, naming, read_option, source_and_out
 from torchrefract.cli.progress import Skipped, batches, print_warning, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.configuration import CONFIG, claim
+from torchrefract.data.pairs.configuration import CONFIG
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.video import read_video, video_info
 from torchrefract.depth import RoadSpreadError, TransformersDepth
@@ -90,7 +90,7 @@ def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
     content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
-    claim(out, {"source": str(root.resolve()), "model": content})
+    claim_out(out, {"source": str(root.resolve()), "model": content})
 
 
 def _missing_frames(files: Iterable[Path], root: Path, folder: DepthFolder, skipped: Skipped) -> Iterator[_Frame]:

@@ -35,6 +35,7 @@ from torchrefract.cli.evaluation import changed_values, describe_validation, use
 from torchrefract.cli.options import (
     check_seed,
     check_task_options,
+    claim_out,
     find_device,
     make,
     naming,
@@ -63,7 +64,6 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
-from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.video import convert_video, video_info
@@ -169,7 +169,7 @@ def restore(cfg: DictConfig) -> None:
     if job.deviation:
         _check_maps(files, job)
     with naming("out"):
-        claim(out, _settings(cfg, job))
+        claim_out(out, _settings(cfg, job))
     with locked("out", out):
         if cfg.pool == "lens":
             job = job.with_one_lens(files, out / "camera.yaml")

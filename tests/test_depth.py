@@ -366,6 +366,24 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
 
 
+def test_pairs_are_not_continued_with_other_depth_maps_of_the_same_size(call, tmp_path):
+    write_frames(tmp_path)
+    (tmp_path / "depth" / "b").mkdir(parents=True)
+    for name in ("a", "b/c", "b/d"):
+        np.save(tmp_path / "depth" / f"{name}.npy", np.full((56, 84), 20.0, np.float32))
+    words = ("scene=cape_town_fog", "source=frames", "license=CC0", "workers=0", "depth=depth", "out=pairs")
+    assert call("generate", *words).code == 0
+    path = tmp_path / "pairs" / "config.json"
+    config = json.loads(path.read_text())
+    assert "3 pairs exist already" in call("generate", *words).out
+    np.save(tmp_path / "depth" / "b/c.npy", np.full((56, 84), 30.0, np.float32))
+    message = call("generate", *words).message
+    assert message.startswith("out must be a folder of the same configuration, got pairs, where depth_content is ")
+    del config["settings"]["depth_content"]  # as of an earlier version
+    path.write_text(json.dumps(config))
+    assert "3 pairs exist already" in call("generate", *words).out
+
+
 def test_a_picture_that_changed_after_its_map_was_written_gets_another_one_but_not_beside_maps_of_others(
     call, network, tmp_path
 ):

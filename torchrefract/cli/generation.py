@@ -117,7 +117,7 @@ def generate(cfg: DictConfig) -> None:
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
             about, suffix = {"license": options.license}, shard_suffix(*options.shard)
-            earlier = {"device": "cpu"}
+            earlier = {"device": "cpu", "depth_content": options.settings.get("depth_content")}
             claim_out(out, options.settings, count=options.num_pairs, about=about, earlier=earlier, suffix=suffix)
             options.write_list()
         with locked_shard(out, *options.shard):
@@ -206,7 +206,7 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         if turned := describe_turned([*paths.values()], upright=True):
             print_warning(turned)
     if (depth := depth_folder(cfg)) is not None:
-        plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
+        plain |= sources.depth_digests(depth) | {"depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
     reader = SourceReader(sources.root, plain["size"], depth, camera)

@@ -60,7 +60,7 @@ def test_an_onnx_program_computes_the_model_for_frames_of_the_training_and_any_b
     assert_agrees(oracle, out, "deweather", MODEL_SIZE)
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     assert [value.name for value in session.get_outputs()] == ["restored"]
-    assert session.get_inputs()[0].shape[1:] == [3, *MODEL_SIZE]
+    assert session.get_inputs()[0].shape == session.get_outputs()[0].shape == ["batch", 3, *MODEL_SIZE]
     (about,) = onnx.load(out).metadata_props
     metadata = json.loads(about.value)
     assert (metadata["task"], metadata["licenses"], metadata["outputs"]) == ("deweather", {"data": "CC0"}, ["restored"])

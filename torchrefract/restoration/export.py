@@ -80,9 +80,9 @@ def save_program(
         return
     logging.getLogger("onnxscript").setLevel(logging.ERROR)  # it warns of operators that it does not optimize
     logging.getLogger("onnx_ir").setLevel(logging.WARNING)
-    exported = torch.onnx.export(
-        program, dynamo=True, input_names=[_INPUT], output_names=[*outputs], opset_version=_OPSET, verbose=False
-    )
+    names: dict[str, Any] = {"input_names": [_INPUT], "output_names": [*outputs]}
+    names["dynamic_shapes"] = {_INPUT: {0: "batch"}}  # the program itself numbers its sizes
+    exported = torch.onnx.export(program, dynamo=True, opset_version=_OPSET, verbose=False, **names)
     if exported is None:
         raise UsageError(f"out must be .pt2 for a model without operators in ONNX, got {path}")
     exported.model.metadata_props["about"] = text

@@ -170,6 +170,25 @@ def test_a_stopped_or_killed_run_continues_to_the_end_of_an_uninterrupted_one(ca
         assert all(torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4) for name in expected)
 
 
+def test_sigterm_during_the_report_of_a_training_stops_it_behind_the_verdict(call, trained, monkeypatch):
+    def stop(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    def save(figure: Any, path: Any, **options: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        path.write(b"a picture")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        outcome = call("eval", f"ckpt_path={trained.folder / 'best.ckpt'}", "run_dir=run", "data.workers=0")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert outcome.code == 143
+    assert Path("run/panel.png").read_bytes() == b"a picture"
+    assert outcome.out.rstrip().splitlines()[-1].startswith("the model: ")
+
+
 def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     message = call("train", *trained.words, "hydra.run.dir=run").message

@@ -442,6 +442,23 @@ def test_a_run_without_a_map_leaves_no_folder_and_a_wrong_device_is_named(call, 
     assert message == "device must be auto, cpu or another device of this machine, got tpu"
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("network=someone/no-such-model", "network must be a depth model of the hub that can be reached, or a folder"),
+        ("network=frames", "network: "),  # that of transformers
+        ("scale_by=meters", "scale_by must be one of road, model, got 'meters'"),
+        ("max_spread=-1", "max_spread must be above 0, got -1"),
+        ("road.camera_height=-1", "road.camera_height must be above 0, got -1"),
+        ("road.horizon=low", "road.horizon must be a real number, got 'low'"),
+    ],
+)
+def test_an_invalid_option_of_the_command_is_named_as_the_command_has_it(call, tmp_path, word, message):
+    write_frames(tmp_path)
+    *_, line = call("estimate_depth", "source=frames", "out=depth", word).err.splitlines()
+    assert line.startswith(f"error: {message}")
+
+
 def test_two_pictures_that_would_share_a_map_raise(call, tmp_path):
     write_frames(tmp_path)
     (tmp_path / "frames" / "a.jpg").write_bytes((tmp_path / "frames" / "b" / "c.jpg").read_bytes())
@@ -494,7 +511,7 @@ def test_a_missing_library_is_named(call, tmp_path, monkeypatch):
     write_frames(tmp_path)
     monkeypatch.setitem(sys.modules, "transformers", None)
     message = call("estimate_depth", "source=frames", "out=depth", "network=anywhere").message
-    assert message == 'model: depth networks need transformers: pip install "torchrefract[depth]"'
+    assert message == 'network: depth networks need transformers: pip install "torchrefract[depth]"'
 
 
 def test_the_frames_of_videos_have_maps_by_their_numbers(call, network, tmp_path):

@@ -31,6 +31,11 @@ from torchrefract.warping.flow import resize_image
 Predictor = Callable[[Tensor], Tensor]  # from a frame (1, 3, H, W) to the flow (1, 2, h, w) that undistorts it
 
 
+# Options of `estimate_depth` by the arguments of from_transformers and GroundPlaneDepth.
+_OPTIONS = {"name_or_folder": "network", "scale": "scale_by"}
+_OPTIONS |= {name: f"road.{name}" for name in ("camera_height", "focal", "horizon")}
+
+
 class _Frame(NamedTuple):
     image: Tensor  # (3, H, W)
     target: Path
@@ -50,12 +55,7 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     pictures = [relative_name(file, root) for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
     cfg.device = str(find_device(str(cfg.device)))
-    try:
-        network = make(cfg, "model")
-    except ImportError as error:
-        raise UsageError(f"model: {error}") from error
-    if not isinstance(network, TransformersDepth):
-        raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
+    network = _make_network(cfg)
     with naming("out"):
         if (out / CONFIG).is_file():
             _claim(cfg, out, root)
@@ -81,6 +81,19 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     print(f"{out}: {num_written} depth maps written, {len(skipped.errors)} frames skipped{spread}")
     if skipped.errors:
         raise SystemExit(1)
+
+
+def _make_network(cfg: DictConfig) -> TransformersDepth:
+    """Load the network; errors name the options of the command."""
+    try:
+        network = make(cfg, "model")
+    except (UsageError, ImportError) as error:
+        argument, must, rest = str(error).removeprefix("model: ").partition(" must ")
+        named = f"{_OPTIONS.get(argument, argument)}{must}{rest}"
+        raise UsageError(named if must else f"network: {argument}") from error
+    if not isinstance(network, TransformersDepth):
+        raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
+    return network
 
 
 def _claim(cfg: DictConfig, out: Path, root: Path) -> None:

@@ -97,7 +97,13 @@ def calibrate(cfg: DictConfig) -> None:
     out = Path(str(cfg.out))
     with naming("out"):
         make_writable_folder(out)
-    files = _rendered(board, out / "rendered") if str(cfg.images) == _SYNTHETIC else find_pictures(str(cfg.images))
+    with locked("out", out):
+        is_synthetic = str(cfg.images) == _SYNTHETIC
+        files = _rendered(board, out / "rendered") if is_synthetic else find_pictures(str(cfg.images))
+        _calibrate(files, board, out, model=model, max_drop_share=max_drop_share)
+
+
+def _calibrate(files: Sequence[Path], board: Board, out: Path, *, model: str, max_drop_share: float) -> None:
     if turned := media.describe_turned(files):
         print(turned)
     search = detect_all(files, board, out / "detections.jsonl")

@@ -105,6 +105,18 @@ def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(ca
     assert "severity 3\n" in call("train", *words, "scene=cape_town_fog", "run_dir=fog").out
 
 
+def test_a_training_on_frames_without_depth_maps_names_its_option(call, small, tmp_path):
+    for name in ("train/0.png", "train/1.png", "val/0.png"):
+        save_picture(tmp_path / "frames" / name, np.full((32, 64, 3), 90, np.uint8))
+    words = (*(word for word in small if "count" not in word), "data=frames", "data.root=frames")
+    outcome = call("train", "+task=deweather", "scene=cape_town_fog", *words, "trainer.max_epochs=0", "run_dir=run")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "warning: HeterogeneousFog assumes the depth of a road between walls; depth maps, as estimate_depth writes "
+        "them, are better: data.depth=...\n"
+    )
+
+
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
     for name in ("train/loss", "train/psnr", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         assert sorted(metrics(trained.folder, name)) == [0, 1]

@@ -43,7 +43,7 @@ from torchrefract.cli.options import (
     read_option,
     read_optional,
 )
-from torchrefract.cli.progress import Skipped, batches, check_none_lost, print_warning, progress
+from torchrefract.cli.progress import Skipped, batches, check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
@@ -245,6 +245,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
             f"trainer must be ddp with trainer.devices={devices}{nodes} under torchrun, got one that uses "
             f"{trainer.world_size} of {processes} processes"
         )
+    has_no_depth = isinstance(data.train, FrameFolder) and data.train.depth is None
+    if has_no_depth and data.effect is not None and trainer.is_global_zero:
+        warn_of_assumed_depth(data.effect, option="data.depth")
     with naming("data"):
         data.check_ranks(trainer.world_size)
         data.check_pair()

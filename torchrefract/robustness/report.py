@@ -184,7 +184,8 @@ def _tolerated(result: Robustness, scene: str, loss: float) -> tuple[str, str, s
     elif estimate.value == mildest:
         kind = "none"
     low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
-    return kind, f"{estimate.value:.3g} {quantity.unit}".rstrip(), f"{low} to {high}"
+    interval = "open" if low == high == "open" else f"{low} to {high}"
+    return kind, f"{estimate.value:.3g} {quantity.unit}".rstrip(), interval
 
 
 def _flat(row: Row) -> dict[str, Any]:

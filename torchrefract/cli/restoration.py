@@ -209,7 +209,7 @@ def export(cfg: DictConfig) -> None:
         )
     height, width = loaded.size if cfg.size is None else _parse_size(str(cfg.size))
     interpolation = read_option(cfg, "interpolation", check_choice, choices=INTERPOLATIONS)
-    with naming("out"):
+    with naming("out"), locked("out", out.parent, out.name):
         errors = export_model(loaded, out, size=(height, width), interpolation=interpolation)
     differences = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
     print(

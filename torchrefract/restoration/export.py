@@ -29,7 +29,7 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
 
     Args:
         loaded: a model that restores in a single pass.
-        out: the file to write, .onnx or .pt2.
+        out: the file to write, .onnx or .pt2; no other process may write it.
         size: (height, width) of the frames, px.
         interpolation: interpolation of the warp along a predicted flow.
 
@@ -56,7 +56,7 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
         "outputs": [*expected],
         "licenses": loaded.licenses,
     }
-    with replace_file(out) as path:
+    with replace_file(out, alone=True) as path:
         save_program(program, path, outputs=[*expected], metadata=metadata)
         return _compare(path, images, expected)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchrefract import key_of, random
+from torchrefract import LensDistortion, key_of, random
 
 WORD = 2**32
 COUNT, NOISE_COUNT = 20_000, 400_000
@@ -123,6 +123,17 @@ def test_seeds_and_keys_inside_vmap_and_as_tensors_give_the_same_numbers():
     key = noise_keys()
     noise = torch.func.vmap(lambda one: random.white_noise(one[None], 1_021)[0])(key)
     assert torch.equal(noise, random.white_noise(key, 1_021))
+
+
+@pytest.mark.quick
+def test_a_seed_and_keys_may_lie_on_different_devices():
+    cpu, other = torch.device("cpu"), torch.device("meta")
+    for of_seed, of_keys, expected in ((cpu, other, other), (other, cpu, other), (cpu, cpu, cpu)):
+        source = random.stream(torch.tensor(7, device=of_seed), torch.arange(3, device=of_keys))
+        assert source.words.shape == (2, 3)
+        assert random.uniform(source, 4).device == expected
+    image = torch.empty(3, 3, 8, 9, device=other)
+    assert LensDistortion().degrade(image, keys=torch.arange(3, device=other)).flow.device == other
 
 
 @pytest.mark.quick

@@ -109,6 +109,11 @@ def first_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + more
 
 
+def type_name(value: object) -> str:
+    """Return the name of a value's type, for a message; "the class X" for a class in the place of an instance."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
 def check_tensor(name: str, value: Tensor) -> Tensor:
     """Return `value` if it is a tensor."""
     if not isinstance(value, Tensor):
@@ -238,7 +243,8 @@ def _has_memory(value: Tensor) -> bool:
 def _check_real(name: str, value: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | numbers.Real):
         raise TypeError(f"{name} must be a real number, got {value!r}")
-    if math.isnan(value):
+    # math.isnan breaks a graph in which torch.compile makes symbols of numbers that differ from an earlier effect's.
+    if not -math.inf <= value <= math.inf:
         raise ValueError(f"{name} must not be NaN, got {value}")
     # Small NumPy types cannot be compared with large bounds.
     return value if isinstance(value, int | float) else float(value)

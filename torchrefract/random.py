@@ -96,6 +96,8 @@ def stream(seed: int | Tensor, keys: Tensor | range, *, device: torch.device | N
         keys = torch.arange(keys.start, keys.stop, device=seed.device)
     elif seed.device.type != "cpu":
         keys = keys.to(seed.device, non_blocking=True)
+    else:
+        seed = seed.to(keys.device, non_blocking=True)
     return Stream(_threefry(_halves(seed.long()[None]), _halves(keys.long()))[:, 0], device=device)
 
 

@@ -22,7 +22,7 @@ ARGUMENTS: list[tuple[type, dict[str, Any], str]] = [
     (tr.Exposure, {"min_gain": 0.0}, r"min_gain must be a number in"),
     (tr.HeterogeneousFog, {"mode": "volume"}, "mode must be one of image, ray, got 'volume'"),
     (tr.HeterogeneousFog, {"weights": ()}, r"weights must be one number for each of 6 scales, got \(\)"),
-    (tr.HeterogeneousFog, {"scales": (4.0,)}, "weights must be one number for each of 1 scales, got None"),
+    (tr.HeterogeneousFog, {"scales": (4.0,)}, "weights must be one number for each of 1 scales, got None; pass both"),
     (tr.HeterogeneousFog, {"scale_unit": "m"}, "scale_unit must be one of px, cells, got 'm'"),
     (tr.HeterogeneousFog, {"normalize": "max"}, "normalize must be one of theory, image"),
     (tr.HeterogeneousFog, {"mean": "time"}, "mean must be one of image, ensemble"),

@@ -363,6 +363,8 @@ def test_invalid_effects_and_weights_raise():
         Compose(UniformFog())  # pyright: ignore[reportArgumentType]  # the invalid argument
     with pytest.raises(TypeError, match="effects must be effects of torchrefract, got Identity"):
         Compose([torch.nn.Identity()])  # pyright: ignore[reportArgumentType]  # the invalid argument
+    with pytest.raises(TypeError, match="effects must be effects of torchrefract, got the class UniformFog"):
+        Compose([UniformFog])  # pyright: ignore[reportArgumentType]  # the invalid argument
     for weights, rule in (([1.0], "weights must be one number for each of 2"), ([1.0, -1.0], "weights must be")):
         with pytest.raises(ValueError, match=rule):
             OneOf([LensDistortion(), UniformFog()], weights=weights)

@@ -162,7 +162,7 @@ def test_clear_air_keeps_the_image_and_opaque_fog_shows_its_color(mode):
     opaque = effect.apply(image, params._replace(visibility=visibility))
     assert torch.equal(opaque.image, params.airlight[..., None, None].expand_as(image))
     assert torch.autograd.grad(opaque.image.sum(), visibility)[0].isfinite().all()
-    depth = torch.zeros(2, 1, *SIZE, dtype=torch.float64)
+    depth = torch.full((2, 1, *SIZE), 1e-30, dtype=torch.float64)  # a map of zeros is refused
     assert torch.equal(effect.apply(image, params, depth=depth).image, image)
     assert not effect.apply(image, params, depth=depth + math.inf).transmission.any()
 

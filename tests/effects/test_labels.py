@@ -195,6 +195,17 @@ def test_a_tensor_before_the_one_that_a_sample_names_as_its_image_is_not_taken_f
     assert not torch.equal(effect({"image": image, "matrix": torch.eye(3)[None]})["image"], image)
 
 
+@pytest.mark.parametrize("effect", [PINCUSHION, UniformFog()], ids=["lens", "fog"])
+def test_a_list_of_images_raises_instead_of_degrading_the_first_alone(effect):
+    first, second = torch.rand(3, 64, 80), torch.rand(3, 48, 72)
+    for sample in ([first, second], (first, second), {"images": [first, second], "labels": torch.tensor([1, 2])}):
+        with pytest.raises(ValueError, match=r"image must be the only image of a sample, got 2 tensors .* \(3, 64"):
+            effect(sample)
+    degraded, other = effect(first, second)
+    assert not torch.equal(degraded, first)
+    assert other is second
+
+
 def test_plain_positions_raise_even_if_the_effect_does_not_apply():
     with pytest.raises(TypeError, match=r"target\['boxes'\] must be a BoundingBoxes of torchvision to move with the"):
         LensDistortion(p=0.0)(torch.rand(3, 40, 56), {"boxes": torch.zeros(2, 4)})

@@ -145,6 +145,16 @@ def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch(
                     compiled(images[limit])
 
 
+@pytest.mark.filterwarnings("ignore:depth is that of a road")
+def test_effects_of_one_class_with_other_numbers_have_a_graph_each():
+    image = random_image(1, 3, 12, 16)
+    for fx in (15.0, 17.0):  # torch.compile makes a symbol of a number that differs
+        camera = tr.Camera(width=16, height=12, fx=fx, fy=fx, cx=7.5, cy=5.5, coefficients=(0.0,) * 4)
+        effect = tr.UniformFog(camera=camera, depth=tr.CorridorDepth(focal=fx / 16))
+        compiled = torch.compile(effect, fullgraph=True, backend="eager")
+        assert_close(seeded(compiled, image), seeded(effect, image), rtol=0, atol=2e-4)
+
+
 @pytest.mark.parametrize("effect", [tr.ThinPlateSpline(), tr.LensDistortion()], ids=["spline", "lens"])
 def test_a_model_with_an_effect_is_exported_as_a_graph_that_draws(effect):
     model, image = nn.Sequential(nn.Conv2d(3, 3, 1), effect).train(), random_image(2, 3, 24, 32)

@@ -64,6 +64,13 @@ def test_the_airlight_without_sky_is_the_color_of_the_thickest_haze():
     assert_close(airlight_of_frame(haze(color)), color[None].double(), rtol=0, atol=1e-4)
 
 
+def test_the_airlight_of_mirrored_frames_is_the_same():
+    frames = 0.3 + 0.6 * torch.rand(8, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))  # without sky
+    expected = airlight_of_frame(frames)
+    assert expected.min() > 0.4
+    assert torch.equal(airlight_of_frame(frames.flip(3)), expected)  # many nodes share a value of the dark channel
+
+
 def test_dust_is_laterite_by_day_and_as_dark_as_the_night():
     laterite = torch.tensor([[0.78, 0.71, 0.61]], dtype=torch.float64)
     assert torch.equal(dust_airlight(street((0.9, 0.9, 0.9), (0.3, 0.3, 0.3))), laterite)

@@ -260,8 +260,9 @@ def test_check_depth_rejects_stored_integers_and_maps_with_holes():
             ValueError, match=r"depth must be known at each pixel, got 0 at 9[3-7] % of them; fill these"
         ):
             check_depth(lidar)
+        with pytest.raises(ValueError, match=r"depth must be known at each pixel, got 0 at 100 % of them; fill these"):
+            check_depth(torch.zeros_like(sample))
         check_depth(sample.round())
-        check_depth(torch.zeros_like(sample))
 
 
 def test_check_depth_accepts_real_roads_and_rejects_converted_ones(shared_data):
@@ -278,7 +279,7 @@ def test_check_depth_accepts_real_roads_and_rejects_converted_ones(shared_data):
 
 def test_check_depth_accepts_unusual_depths_in_meters():
     ramp = torch.linspace(0, 1, 200).view(1, 1, -1, 1).expand(1, 1, 200, 300)
-    for depth in (0 * ramp, 0 * ramp + 0.5, 0 * ramp + 1, 1 + 149 * ramp, 150 * ramp, 160 * (1 - ramp), ramp / 0):
+    for depth in (0 * ramp + 0.5, 0 * ramp + 1, 1 + 149 * ramp, 150 * ramp, 160 * (1 - ramp), ramp / 0):
         check_depth(depth.nan_to_num(posinf=math.inf))
     check_depth(torch.zeros(0, 1, 4, 5))
     check_depth(torch.tensor([[[[0.0, 9.0]]]]))

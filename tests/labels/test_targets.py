@@ -558,7 +558,7 @@ SMALL = tv.KeyPoints(torch.zeros(1, 2), canvas_size=(5, 5))
         ({"depth": np.zeros((*SIZE, 1))}, {}, TypeError, r"got a plain ndarray \(36, 64, 1\); pass tv_tensors.Mask"),
         ({"p": tv.KeyPoints(torch.zeros(1, 2), canvas_size=SIZE), "visible": torch.ones(2)}, {}, ValueError, "visible"),
         ([1, 2, 3], {"flow": SHIFT[None]}, ValueError, "target must have one sample for each of the 1 flows, got 3"),
-        ({"boxes": BOXES}, {"flow": SHIFT[None]}, ValueError, "target must be a list of samples if it holds"),
+        ({"boxes": BOXES}, {"flow": SHIFT[None]}, ValueError, "target must be a list of .*, got BoundingBoxes$"),
         (tv.Mask(torch.zeros(SIZE)), {"flow": SHIFT[None]}, ValueError, "target must have the batch of the flow, 1"),
     ],
 )

@@ -34,8 +34,8 @@ class AlbumentationsEffect(DualTransform):
     `keypoints`, volumes, and additional targets. Images are uint8 or floating in [0, 1].
 
     The seed of the draw comes from the generator of the `Compose`, so `Compose(seed=...)` and `ReplayCompose` repeat
-    it. In workers of a DataLoader, a `Compose` without a seed draws by the seed of the worker; one with a seed repeats
-    its draws in each worker and epoch, as it does for all transforms.
+    it. In workers of a DataLoader, a `Compose` without a seed draws anew in each worker and epoch, and no seed of
+    PyTorch repeats it; one with a seed repeats its draws in each worker and epoch, as it does for all transforms.
 
     Boxes become the smallest boxes around the part of their warped outlines in the frame. Those that leave it go, with
     their labels, as do those below the `min_visibility` of `BboxParams`, the visible share of the warped box. Masks

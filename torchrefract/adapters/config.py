@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import nn
 
+from torchrefract._validation import type_name
 from torchrefract.effects.base import Effect
 
 
@@ -27,7 +28,7 @@ def effect_from_config(config: dict[str, Any]) -> Effect:
     """
     effect = _from_plain(config)
     if not isinstance(effect, Effect):
-        raise TypeError(f"effect must be an effect or its config, got {type(effect).__name__}")
+        raise TypeError(f"effect must be an effect or its config, got {type_name(effect)}")
     return effect
 
 

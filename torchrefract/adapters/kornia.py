@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrefract import random
+from torchrefract._validation import type_name
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import check_kornia_keys
 from torchrefract.labels.boxes import warp_boxes
@@ -51,7 +52,7 @@ class KorniaEffect(RigidAffineAugmentationBase2D):
     def __init__(self, effect: Effect, *, same_on_batch: bool = False, keepdim: bool = False):
         super().__init__(p=1.0, same_on_batch=same_on_batch, keepdim=keepdim)
         if not isinstance(effect, Effect):
-            raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
+            raise TypeError(f"effect must be an effect of torchrefract, got {type_name(effect)}")
         self.effect = effect
         self._drawn: tuple[Tensor | None, Tensor | None] = None, None  # the seed and flow of the last images
         self.flags = {"resample": Resample.NEAREST}  # of masks; `extra_args` of a container replace it

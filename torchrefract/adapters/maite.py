@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrefract._validation import check_whole
+from torchrefract._validation import check_whole, type_name
 from torchrefract.effects.base import Effect
 from torchrefract.labels.boxes import warp_boxes
 from torchrefract.labels.targets import is_tv_tensor
@@ -47,7 +47,7 @@ class MaiteAugmentation:
 
     def __init__(self, effect: Effect, *, seed: int = 0, id: str | None = None):
         if not isinstance(effect, Effect):
-            raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
+            raise TypeError(f"effect must be an effect of torchrefract, got {type_name(effect)}")
         self.effect = effect
         self.seed = check_whole("seed", seed)
         self.metadata: Any = {"id": f"torchrefract.{type(effect).__name__}" if id is None else id}

@@ -94,7 +94,7 @@ class Effect(nn.Module, ABC):
 
         `effect(image)`, `effect(image, target)`, `effect(image, boxes, labels)` and one sample, a dict, list or tuple
         with the image in it, work as in torchvision's transforms. The image of a sample is its torchvision `Image` or
-        `Video` or, if it has neither, its first plain tensor.
+        `Video` or, if it has neither, its first plain tensor. A list of images raises ValueError.
 
         Args:
             image: as for the class, or a sample.
@@ -404,7 +404,19 @@ def _find_image(leaves: list[Any], names: list[str]) -> int:
             f"image must be the first tensor of a sample, or an Image of torchvision, got {names[place]!r} before "
             f"{names[named[0]]!r}; wrap it as tv_tensors.Image(...)"
         )
+    alike = [k for k in plain if names[k] == names[place] and _looks_alike(leaves[k], leaves[place])]
+    if not images and len(alike) > 1:
+        raise ValueError(
+            f"image must be the only image of a sample, got {len(alike)} tensors such as {tuple(leaves[place].shape)}; "
+            "stack images of one size, call the effect for each image, or pass other tensors after the image"
+        )
     return place
+
+
+def _looks_alike(value: Any, image: Any) -> bool:
+    """Return True for tensors (C, H, W) of one type and number of channels, as in the list of a detector's images."""
+    is_tensor = isinstance(value, Tensor) and isinstance(image, Tensor)
+    return is_tensor and value.ndim == 3 and value.dtype is image.dtype and value.shape[:1] == image.shape[:1]
 
 
 def _check_seed(seed: int | Tensor) -> int | Tensor:

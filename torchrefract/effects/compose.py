@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torchrefract import random
 from torchrefract._tensor import as_device_tensor, assume_constant_result
-from torchrefract._validation import check_choice, check_number, requires_grad
+from torchrefract._validation import check_choice, check_number, requires_grad, type_name
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import params_per_frame, params_to, select_params
 from torchrefract.effects.batch_flow import FlowPart, SamplingOptions, can_read, flow_on_measured_lattice, zero_flow
@@ -78,7 +78,7 @@ class Compose(Effect):
             raise ValueError("effects must be at least one effect, got none")
         for effect in effects:
             if not isinstance(effect, Effect):
-                raise TypeError(f"effects must be effects of torchrefract, got {type(effect).__name__}")
+                raise TypeError(f"effects must be effects of torchrefract, got {type_name(effect)}")
         self.effects = cast(Sequence[Effect], nn.ModuleList(effects))
         self.padding = None if padding is None else check_choice("padding", padding, PADDINGS)
         self.interpolation = (

@@ -443,7 +443,7 @@ def _check_scales(
     if not scales:
         raise ValueError("scales must be at least one number above 0, got none")
     if weights is None or len(weights) != len(scales):
-        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}")
+        raise ValueError(f"weights must be one number for each of {len(scales)} scales, got {weights}; pass both")
     weights = tuple(check_number("weights", weight, low=0.0) for weight in weights)
     if sum(weights) <= 0:
         raise ValueError(f"weights must have a sum above 0, got {weights}")

@@ -45,8 +45,8 @@ def airlight_of_frame(image: Tensor) -> Tensor:
     sky = (nodes * is_low).sum(dim=(2, 3)) / is_low.sum(dim=(2, 3)).clamp(min=1)
     dark = -highest_nearby(-nodes.amin(dim=1, keepdim=True), _PATCH // 2)
     count = max(1, round(dark.shape[2:].numel() * _BRIGHTEST))
-    places = dark.flatten(1).topk(count, dim=1).indices[:, None].expand(-1, image.shape[1], -1)
-    haze = nodes.flatten(2).gather(2, places).mean(dim=2)
+    is_haze = dark >= dark.flatten(1).topk(count, dim=1).values[:, -1].view(-1, 1, 1, 1)  # patches have equal values
+    haze = (nodes * is_haze).sum(dim=(2, 3)) / is_haze.sum(dim=(2, 3))
     top = nodes[:, :, : max(1, nodes.shape[2] // 3)]
     upper, middle = (luma(part).flatten(1).median(dim=1).values for part in (top, nodes))
     is_night = seen.is_night | (upper < _NIGHT) | ((upper < _DUSK) & (upper < 0.9 * middle))

@@ -298,14 +298,16 @@ def check_depth(depth: Tensor, *, name: str = "depth") -> None:
 def _check_not_raw(name: str, values: Tensor) -> None:
     """Raise ValueError for stored integers, as millimeters, and for maps with holes, as lidar and stereo give."""
     share = (values == 0).float().mean().item()
-    measured = values[values.isfinite() & (values > 0)]
-    if values.numel() < _FEWEST or measured.numel() == 0 or measured.amin() == measured.amax():
+    if values.numel() < _FEWEST:
         return
     if share > _MAX_HOLES:
         raise ValueError(
             f"{name} must be known at each pixel, got 0 at {100 * share:.0f} % of them; fill these holes, such as by a "
             "depth network"
         )
+    measured = values[values.isfinite() & (values > 0)]
+    if measured.numel() == 0 or measured.amin() == measured.amax():
+        return
     if measured.median() > _FARTHEST_MEDIAN and bool((measured == measured.round()).all()):
         raise ValueError(
             f"{name} must be in m, got whole numbers from {measured.amin():g} to {measured.amax():g}; divide by 1000 "

@@ -265,7 +265,7 @@ def _warp_keypoints(keypoints: Any, flow: Tensor) -> _Warped:
 def _warp_bounding_boxes(boxes: Any, flow: Tensor, options: _Options) -> _Warped:
     _check_canvas(boxes, flow)
     if flow.ndim == 4:
-        raise ValueError(f"target must be a list of samples if it holds boxes and flow is a batch, got {type(boxes)}")
+        raise ValueError("target must be a list of samples if it holds boxes and flow is a batch, got BoundingBoxes")
     plain = boxes.as_subclass(Tensor)
     if plain.shape == (1, 0):  # torchvision makes this of an empty list
         return _Warped(boxes)

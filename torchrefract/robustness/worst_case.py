@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torchrefract import random
-from torchrefract._validation import check_count, check_number, check_tensor, check_whole
+from torchrefract._validation import check_count, check_number, check_tensor, check_whole, type_name
 from torchrefract.effects.base import Effect
 from torchrefract.effects.batch import check_image, check_image_values
 from torchrefract.robustness.evaluate import move_target
@@ -80,7 +80,7 @@ def worst_case(
     steps, restarts = check_count("steps", steps), check_count("restarts", restarts)
     lr, seed = check_number("lr", lr, low=1e-6, high=1.0), check_whole("seed", seed)
     if not isinstance(effect, Effect):
-        raise TypeError(f"effect must be an effect of torchrefract, got {type(effect).__name__}")
+        raise TypeError(f"effect must be an effect of torchrefract, got {type_name(effect)}")
     if not check_tensor("image", image).is_floating_point():
         raise TypeError(f"image must be floating in [0, 1], got {image.dtype}; use image.float() / 255 for uint8")
     if torch.is_inference_mode_enabled():

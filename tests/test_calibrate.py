@@ -15,6 +15,7 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, render_views
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_covariance, read_opencv
 from torchrefract.cli import calibration
+from torchrefract.data.pairs.manifest import locked
 
 SMALL = Camera(width=640, height=400, fx=380.0, fy=381.0, cx=322.3, cy=196.6, coefficients=(-0.25, 0.08, 0.003, -0.002))
 BOARD = Charuco(squares="6x5", square_mm=30, marker_mm=20, dictionary="DICT_4X4_50")
@@ -43,6 +44,14 @@ def covariance_shape(folder: Path) -> tuple[int, ...]:
 
 def read_report(tmp_path: Path) -> str:
     return (tmp_path / "calibration" / "report.md").read_text()
+
+
+def test_a_folder_that_another_run_writes_to_is_an_error(call, tmp_path, pictures):
+    (tmp_path / "calibration").mkdir()
+    with locked("out", tmp_path / "calibration"):
+        message = call("calibrate", *OPTIONS).message
+    assert message.startswith("out must not be in use, got calibration, which another run writes to")
+    assert not any((tmp_path / "calibration").iterdir())
 
 
 def test_rendered_pictures_on_a_full_disk_raise(tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from pictures import (
 from processes import running, wait_for
 from pycocotools.coco import COCO
 
-from torchrefract import key_of, presets, warp, warp_boxes, warp_mask
+from torchrefract import __version__, key_of, presets, warp, warp_boxes, warp_mask
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import write_opencv
 from torchrefract.data.images import read_image
@@ -67,6 +67,21 @@ def test_pictures_keep_their_names_and_are_drawn_by_them(call, folder):
     (folder / "raw" / "a.png").unlink()
     assert call("degrade", *WORDS, "seed=5", "out=more").code == 0
     assert (folder / "more" / NAMES[1]).read_bytes() == (folder / "out" / NAMES[1]).read_bytes()
+
+
+def test_a_folder_of_another_version_is_continued_with_a_warning(call, folder):
+    (folder / "raw" / NAMES[1]).rename(folder / "b.png")
+    assert call("degrade", *WORDS).code == 0
+    path = folder / "out" / "config.json"
+    config = json.loads(path.read_text())
+    expected = {"torchrefract": __version__, "torch": torch.__version__, "numpy": np.__version__}
+    assert config["made_with"] == expected | {"opencv": cv2.__version__}
+    path.write_text(json.dumps(config | {"made_with": expected | {"torchrefract": "0.0"}}))
+    (folder / "b.png").rename(folder / "raw" / NAMES[1])
+    outcome = call("degrade", *WORDS)
+    assert outcome.out.startswith("out: 1 degraded, 2 already existed")
+    assert outcome.err.startswith("warning: the files in out were made with torchrefract 0.0, torch ")
+    assert call("degrade", *WORDS).err == ""
 
 
 def test_a_stopped_run_is_resumed_with_the_same_bytes_in_processes(call, folder):
@@ -198,11 +213,10 @@ def test_a_picture_is_degraded_as_displayed_and_keeps_16_bits(call, tmp_path):
     save_picture(tmp_path / "raw" / "deep.png", smooth_picture().astype(np.uint16) * 257)
     save_turned(tmp_path / "raw" / "phone.png", smooth_picture(), 6)
     assert call("degrade", *WORDS).code == 0
-    for name in ("phone.png", "deep.png"):
+    for name, shape, bits in (("phone.png", (3, 96, 48), 8), ("deep.png", (3, 48, 96), 16)):
         expected = degraded(tmp_path, name, presets.cheap_dashcam(4)).image[0]
-        bits = 16 if name == "deep.png" else 8
+        assert expected.shape == shape
         assert (read_image(tmp_path / "out" / name) - expected).abs().max() < 0.51 / (2**bits - 1) + 1e-5
-    assert expected.shape == (3, 48, 96)
 
 
 def test_a_picture_that_changed_after_it_was_degraded_is_degraded_again(call, folder):

@@ -366,6 +366,24 @@ def test_the_command_writes_maps_that_fog_and_pairs_use_and_continues(call, netw
     assert re.fullmatch(r"depth must be a folder with a map for each frame, got none for a\.png in depth .*", message)
 
 
+def test_pairs_are_not_continued_with_other_depth_maps_of_the_same_size(call, tmp_path):
+    write_frames(tmp_path)
+    (tmp_path / "depth" / "b").mkdir(parents=True)
+    for name in ("a", "b/c", "b/d"):
+        np.save(tmp_path / "depth" / f"{name}.npy", np.full((56, 84), 20.0, np.float32))
+    words = ("scene=cape_town_fog", "source=frames", "license=CC0", "workers=0", "depth=depth", "out=pairs")
+    assert call("generate", *words).code == 0
+    path = tmp_path / "pairs" / "config.json"
+    config = json.loads(path.read_text())
+    assert "3 pairs exist already" in call("generate", *words).out
+    np.save(tmp_path / "depth" / "b/c.npy", np.full((56, 84), 30.0, np.float32))
+    message = call("generate", *words).message
+    assert message.startswith("out must be a folder of the same configuration, got pairs, where depth_content is ")
+    del config["settings"]["depth_content"]  # as of an earlier version
+    path.write_text(json.dumps(config))
+    assert "3 pairs exist already" in call("generate", *words).out
+
+
 def test_a_picture_that_changed_after_its_map_was_written_gets_another_one_but_not_beside_maps_of_others(
     call, network, tmp_path
 ):
@@ -424,6 +442,23 @@ def test_a_run_without_a_map_leaves_no_folder_and_a_wrong_device_is_named(call, 
     assert message == "device must be auto, cpu or another device of this machine, got tpu"
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("network=someone/no-such-model", "network must be a depth model of the hub that can be reached, or a folder"),
+        ("network=frames", "network: "),  # that of transformers
+        ("scale_by=meters", "scale_by must be one of road, model, got 'meters'"),
+        ("max_spread=-1", "max_spread must be above 0, got -1"),
+        ("road.camera_height=-1", "road.camera_height must be above 0, got -1"),
+        ("road.horizon=low", "road.horizon must be a real number, got 'low'"),
+    ],
+)
+def test_an_invalid_option_of_the_command_is_named_as_the_command_has_it(call, tmp_path, word, message):
+    write_frames(tmp_path)
+    *_, line = call("estimate_depth", "source=frames", "out=depth", word).err.splitlines()
+    assert line.startswith(f"error: {message}")
+
+
 def test_two_pictures_that_would_share_a_map_raise(call, tmp_path):
     write_frames(tmp_path)
     (tmp_path / "frames" / "a.jpg").write_bytes((tmp_path / "frames" / "b" / "c.jpg").read_bytes())
@@ -476,7 +511,7 @@ def test_a_missing_library_is_named(call, tmp_path, monkeypatch):
     write_frames(tmp_path)
     monkeypatch.setitem(sys.modules, "transformers", None)
     message = call("estimate_depth", "source=frames", "out=depth", "network=anywhere").message
-    assert message == 'model: depth networks need transformers: pip install "torchrefract[depth]"'
+    assert message == 'network: depth networks need transformers: pip install "torchrefract[depth]"'
 
 
 def test_the_frames_of_videos_have_maps_by_their_numbers(call, network, tmp_path):

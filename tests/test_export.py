@@ -2,6 +2,7 @@ import json
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import onnx
 import onnxruntime
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor
 
 from torchrefract import warp
+from torchrefract._validation import UsageError
+from torchrefract.data.pairs.manifest import locked
 from torchrefract.restoration import export
 from torchrefract.restoration.checkpoints import load_model
 from torchrefract.restoration.models.lens_net import LensEncoder
@@ -60,7 +63,7 @@ def test_an_onnx_program_computes_the_model_for_frames_of_the_training_and_any_b
     assert_agrees(oracle, out, "deweather", MODEL_SIZE)
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     assert [value.name for value in session.get_outputs()] == ["restored"]
-    assert session.get_inputs()[0].shape[1:] == [3, *MODEL_SIZE]
+    assert session.get_inputs()[0].shape == session.get_outputs()[0].shape == ["batch", 3, *MODEL_SIZE]
     (about,) = onnx.load(out).metadata_props
     metadata = json.loads(about.value)
     assert (metadata["task"], metadata["licenses"], metadata["outputs"]) == ("deweather", {"data": "CC0"}, ["restored"])
@@ -92,6 +95,24 @@ def test_a_program_that_disagrees_with_the_model_is_deleted(call, tmp_path, brig
     message = call("export", f"ckpt_path={brighter}", "out=model.pt2").message
     assert message.startswith("out must agree with the model, got restored off by ")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_export_left_is_replaced_by_the_next_one(call, tmp_path, brighter, monkeypatch):
+    left = list[Path]()
+
+    def save(program: Any, path: Path, **_: Any) -> None:
+        path.write_text("a program")
+        left.append(path)
+        with pytest.raises(UsageError, match="out must not be in use"), locked("out", tmp_path, "model.pt2"):
+            pass
+
+    monkeypatch.setattr(export, "trace", lambda *_: None)
+    monkeypatch.setattr(export, "save_program", save)
+    monkeypatch.setattr(export, "_compare", lambda *_: {})
+    for _ in range(2):
+        assert call("export", f"ckpt_path={brighter}", "out=model.pt2").code == 0
+    assert left[0] == left[1] != tmp_path / "model.pt2"
+    assert [path.name for path in tmp_path.iterdir()] == ["model.pt2"]
 
 
 def test_a_model_with_several_passes_is_rejected(call, brighter, monkeypatch):

@@ -8,7 +8,7 @@ import torch
 from pictures import files_in, load_clip, save_clip, save_picture, smooth_picture
 from PIL import Image
 
-from torchrefract import warp
+from torchrefract import __version__, warp
 from torchrefract.cameras.io import read_camera
 from torchrefract.cli import restoration
 from torchrefract.cli.progress import Skipped
@@ -187,8 +187,9 @@ def test_a_folder_of_other_settings_is_not_continued(call, folder, brighter, shi
         message = call("restore", *(w for w in words if w.split("=")[0] != word.split("=")[0]), word).message
         assert message.startswith("out must be a folder of the same configuration, got out, where ")
         assert difference in message
-    settings = json.loads((folder / "out" / "config.json").read_text())["settings"]
-    assert settings["input"] == str(folder / "raw")
+    config = json.loads((folder / "out" / "config.json").read_text())
+    assert config["settings"]["input"] == str(folder / "raw")
+    assert config["made_with"]["torchrefract"] == __version__
 
 
 def test_a_folder_of_other_files_is_left_alone(call, folder, brighter):

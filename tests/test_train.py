@@ -105,6 +105,18 @@ def test_a_deweathering_of_a_scene_that_moves_pixels_says_what_it_cannot_undo(ca
     assert "severity 3\n" in call("train", *words, "scene=cape_town_fog", "run_dir=fog").out
 
 
+def test_a_training_on_frames_without_depth_maps_names_its_option(call, small, tmp_path):
+    for name in ("train/0.png", "train/1.png", "val/0.png"):
+        save_picture(tmp_path / "frames" / name, np.full((32, 64, 3), 90, np.uint8))
+    words = (*(word for word in small if "count" not in word), "data=frames", "data.root=frames")
+    outcome = call("train", "+task=deweather", "scene=cape_town_fog", *words, "trainer.max_epochs=0", "run_dir=run")
+    assert outcome.code == 0
+    assert outcome.err == (
+        "warning: HeterogeneousFog assumes the depth of a road between walls; depth maps, as estimate_depth writes "
+        "them, are better: data.depth=...\n"
+    )
+
+
 def test_each_epoch_logs_its_scores_and_constant_baselines(trained):
     for name in ("train/loss", "train/psnr", "train/epe", "val/loss", "val/psnr", "val/epe", "val/epe_constant"):
         assert sorted(metrics(trained.folder, name)) == [0, 1]
@@ -168,6 +180,25 @@ def test_a_stopped_or_killed_run_continues_to_the_end_of_an_uninterrupted_one(ca
     for path in (run, folder):
         weights = read_checkpoint(path / "last.ckpt")["state_dict"]
         assert all(torch.allclose(weights[name], expected[name], rtol=0, atol=1e-4) for name in expected)
+
+
+def test_sigterm_during_the_report_of_a_training_stops_it_behind_the_verdict(call, trained, monkeypatch):
+    def stop(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    def save(figure: Any, path: Any, **options: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        path.write(b"a picture")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        outcome = call("eval", f"ckpt_path={trained.folder / 'best.ckpt'}", "run_dir=run", "data.workers=0")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert outcome.code == 143
+    assert Path("run/panel.png").read_bytes() == b"a picture"
+    assert outcome.out.rstrip().splitlines()[-1].startswith("the model: ")
 
 
 def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatch):

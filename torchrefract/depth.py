@@ -104,8 +104,8 @@ class TransformersDepth:
             if width <= self.max_spread
             else RoadSpreadError(
                 f"depth must agree with a flat road up to a spread of {self.max_spread:g}, got {width:.2g}: describe "
-                'your camera by road=GroundPlaneDepth(...), or take the meters of the model by scale="model", in a '
-                "command by scale_by=model"
+                "your camera by road, in a command by road.camera_height, road.focal and road.horizon, or take the "
+                'meters of the network by scale="model", in a command by scale_by=model'
             )
             for (row, factor, width), sky in zip(rows, is_sky, strict=True)
         ]
@@ -151,6 +151,7 @@ def from_transformers(
             cannot be loaded.
     """
     check_choice("scale", scale, _SCALES)
+    max_spread = check_positive("max_spread", max_spread)
     road = GroundPlaneDepth() if road is None else road
     if not isinstance(road, DepthProvider):
         raise TypeError(f"road must be a depth provider such as GroundPlaneDepth(), got {type(road).__name__}")
@@ -172,7 +173,6 @@ def from_transformers(
         ) from error
     if device is not None:
         model = model.to(device)
-    max_spread = check_positive("max_spread", max_spread)
     return TransformersDepth(model, processor, scale=scale, road=road, max_spread=max_spread)
 
 

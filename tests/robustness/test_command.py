@@ -221,7 +221,8 @@ def test_other_settings_in_the_same_folder_are_refused(score, frames):
 def test_predictions_of_clean_pictures_stand_for_labels_and_a_function_for_the_score(score, frames):
     outcome = score(DETECT, "score=bright:count", "scene=cheap_dashcam", "severity=5", "limit=2")
     assert "2 pictures, clean score 1.000" in outcome.out
-    assert "cheap_dashcam: k1 all tested, the strongest -0." in outcome.out
+    assert "without labels, a score is the agreement with the prediction for the clean picture\n" in outcome.out
+    assert "cheap_dashcam: loses at most 10% even at the strongest tested value, k1 -0." in outcome.out
 
 
 def test_a_model_that_detects_nothing_in_clean_pictures_has_no_agreement(score, tmp_path, frames):

@@ -300,7 +300,8 @@ def test_a_model_without_a_score_on_clean_images_tolerates_nothing():
 @pytest.mark.quick
 @pytest.mark.parametrize("values", [[300.0, 100.0], [200.0]])
 @pytest.mark.parametrize(
-    ("score", "expected"), [(0.5, "none tested, the mildest"), (0.95, "all tested, the strongest")]
+    ("score", "expected"),
+    [(0.5, "loses more than 10% even at the mildest"), (0.95, "loses at most 10% even at the strongest")],
 )
 def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(values, score, expected):
     levels = {Level("fog", severity): value for severity, value in enumerate(values, start=1)}
@@ -313,7 +314,8 @@ def test_a_scene_of_which_nothing_or_everything_is_tolerated_is_described_so(val
         quantities={"fog": VISIBILITY},
     )
     value = max(values) if score == 0.5 else min(values)
-    assert format_tolerated(result, "fog", loss=0.1).startswith(f"visibility {expected} {value:.0f} m [")
+    text = format_tolerated(result, "fog", loss=0.1)
+    assert text.startswith(f"{expected} tested value, visibility {value:.0f} m (95 % interval ")
 
 
 def test_unknown_scenes_raise():

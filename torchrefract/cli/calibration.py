@@ -41,7 +41,7 @@ from torchrefract.cameras.calibration.synthetic import CAMERA, NUM_VIEWS, render
 from torchrefract.cameras.calibration.uncertainty import MAX_DEVIATION_PX, Crop, certain_part
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera, read_covariance, read_opencv, write_opencv
-from torchrefract.cli.options import make, naming, read_option
+from torchrefract.cli.options import claim_out, make, naming, read_option
 from torchrefract.cli.progress import Skipped, check_none_lost, print_warning, progress
 from torchrefract.data import media
 from torchrefract.data.images import (
@@ -54,7 +54,6 @@ from torchrefract.data.images import (
     pixels_of,
     read_image,
 )
-from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.video import convert_video
 from torchrefract.fields.rectification import camera_flow, zoom_to_crop
@@ -98,7 +97,13 @@ def calibrate(cfg: DictConfig) -> None:
     out = Path(str(cfg.out))
     with naming("out"):
         make_writable_folder(out)
-    files = _rendered(board, out / "rendered") if str(cfg.images) == _SYNTHETIC else find_pictures(str(cfg.images))
+    with locked("out", out):
+        is_synthetic = str(cfg.images) == _SYNTHETIC
+        files = _rendered(board, out / "rendered") if is_synthetic else find_pictures(str(cfg.images))
+        _calibrate(files, board, out, model=model, max_drop_share=max_drop_share)
+
+
+def _calibrate(files: Sequence[Path], board: Board, out: Path, *, model: str, max_drop_share: float) -> None:
     if turned := media.describe_turned(files):
         print(turned)
     search = detect_all(files, board, out / "detections.jsonl")
@@ -377,7 +382,7 @@ def _claim_for_cameras(out: Path, source: Path, cameras: Mapping[str, Camera]) -
     """Create the output folder with the files of cameras; raise UsageError if it is of another input or camera."""
     folder = source if source.is_dir() else source.parent
     with naming("out"):
-        claim(out, {"input": str(folder.resolve())})
+        claim_out(out, {"input": str(folder.resolve())})
     for name, camera in cameras.items():
         _write_camera(out / name, camera)
 

@@ -23,6 +23,7 @@ from torchrefract._io import is_remote, make_folder, relative_name, replace_file
 from torchrefract._validation import UsageError, check_choice, check_count, first_names
 from torchrefract.cli.options import (
     check_seed,
+    claim_out,
     depth_folder,
     file_digests,
     make_effect,
@@ -49,7 +50,6 @@ from torchrefract.data.label_files import (
     labeled_boxes,
     read_labels,
 )
-from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import FORMATS, count_out_of_range, encode_maps
 from torchrefract.data.pairs.generator import maps_of
 from torchrefract.data.pairs.manifest import locked
@@ -264,7 +264,7 @@ def _degrade(cfg: DictConfig, source: Path, out: Path) -> None:
             "a folder and copy it"
         )
     with naming("out"):
-        claim(out, _settings(cfg, root, job, labels), earlier={"files": None, "drives": None})
+        claim_out(out, _settings(cfg, root, job, labels), earlier={"files": None, "drives": None})
     with locked("out", out):
         finished = {name for name, _ in _read_journal(out)}
         tasks = [

@@ -16,19 +16,24 @@ from torchrefract.cameras.calibration import estimate_lens as estimate
 from torchrefract.cameras.calibration.lens_estimate import focal_of_view
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import OPENCV_SUFFIXES, write_opencv
-from torchrefract.cli.options import find_device, make, naming, read_option, source_and_out
+from torchrefract.cli.options import claim_out, find_device, make, naming, read_option, source_and_out
 from torchrefract.cli.progress import Skipped, batches, print_warning, progress
 from torchrefract.data import media
 from torchrefract.data.depth_maps import DepthFolder, write_depth
 from torchrefract.data.frames import drives_of, evenly_spaced
 from torchrefract.data.images import UnreadableImageError, read_image
-from torchrefract.data.pairs.configuration import CONFIG, claim
+from torchrefract.data.pairs.configuration import CONFIG
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.video import read_video, video_info
 from torchrefract.depth import RoadSpreadError, TransformersDepth
 from torchrefract.warping.flow import resize_image
 
 Predictor = Callable[[Tensor], Tensor]  # from a frame (1, 3, H, W) to the flow (1, 2, h, w) that undistorts it
+
+
+# Options of `estimate_depth` by the arguments of from_transformers and GroundPlaneDepth.
+_OPTIONS = {"name_or_folder": "network", "scale": "scale_by"}
+_OPTIONS |= {name: f"road.{name}" for name in ("camera_height", "focal", "horizon")}
 
 
 class _Frame(NamedTuple):
@@ -50,12 +55,7 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
     pictures = [relative_name(file, root) for file in files if not media.is_video(file)]
     folder.check([(name, None) for name in pictures], exist=False)
     cfg.device = str(find_device(str(cfg.device)))
-    try:
-        network = make(cfg, "model")
-    except ImportError as error:
-        raise UsageError(f"model: {error}") from error
-    if not isinstance(network, TransformersDepth):
-        raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
+    network = _make_network(cfg)
     with naming("out"):
         if (out / CONFIG).is_file():
             _claim(cfg, out, root)
@@ -83,6 +83,19 @@ def _estimate_depth(cfg: DictConfig, source: Path, out: Path) -> None:
         raise SystemExit(1)
 
 
+def _make_network(cfg: DictConfig) -> TransformersDepth:
+    """Load the network; errors name the options of the command."""
+    try:
+        network = make(cfg, "model")
+    except (UsageError, ImportError) as error:
+        argument, must, rest = str(error).removeprefix("model: ").partition(" must ")
+        named = f"{_OPTIONS.get(argument, argument)}{must}{rest}"
+        raise UsageError(named if must else f"network: {argument}") from error
+    if not isinstance(network, TransformersDepth):
+        raise UsageError(f"model must be torchrefract.depth.from_transformers, got {type(network).__name__}")
+    return network
+
+
 def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
     """Note the settings in the output folder; raise UsageError if its maps are of another network, road or source."""
     names = [path.name for path in matching_files(out, "*") if not path.name.startswith(".")]
@@ -90,7 +103,7 @@ def _claim(cfg: DictConfig, out: Path, root: Path) -> None:
         return  # a folder of maps of another program, of which the frames without one are estimated
     model = cast(dict[str, Any], OmegaConf.to_container(cfg.model, resolve=True))
     content = {name: value for name, value in model.items() if name not in ("device", "max_spread")}
-    claim(out, {"source": str(root.resolve()), "model": content})
+    claim_out(out, {"source": str(root.resolve()), "model": content})
 
 
 def _missing_frames(files: Iterable[Path], root: Path, folder: DepthFolder, skipped: Skipped) -> Iterator[_Frame]:

@@ -8,15 +8,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-import cv2
-import numpy as np
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.filesize import decimal
 from torch.utils import _pytree as pytree
 
-import torchrefract
 from torchrefract._io import as_path, is_remote, make_folder, remove_file
 from torchrefract._validation import (
     UsageError,
@@ -29,6 +25,7 @@ from torchrefract._validation import (
 )
 from torchrefract.cli.options import (
     check_seed,
+    claim_out,
     depth_folder,
     disk_errors,
     file_digests,
@@ -45,7 +42,7 @@ from torchrefract.data.frames import Source
 from torchrefract.data.images import UnreadableImageError, opened
 from torchrefract.data.media import describe_turned
 from torchrefract.data.pairs.card import summarize, write_card
-from torchrefract.data.pairs.configuration import CONFIG, check_shards, claim, read_config, shard_configs, shard_suffix
+from torchrefract.data.pairs.configuration import CONFIG, check_shards, read_config, shard_configs, shard_suffix
 from torchrefract.data.pairs.files import FORMATS
 from torchrefract.data.pairs.generator import (
     PairGenerator,
@@ -72,8 +69,6 @@ _SHOWN = 20  # unreadable frames that are listed at the end; README.md and the m
 _SAMPLES = 4  # pairs that the estimate of the size on disk rests on
 _TAGS = 16  # frames whose orientation is read beside a camera
 _SEED_END = 2**31  # a seed is shifted by 32 bits, and must then fit 64 bits with a sign
-_VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
-_VERSIONS |= {"numpy": np.__version__, "opencv": cv2.__version__}
 
 
 class Shard(NamedTuple):
@@ -121,14 +116,10 @@ def generate(cfg: DictConfig) -> None:
         make_folder(out)
         with locked("out", out, "sources", wait=True):  # other shards wait for the list instead of scanning again
             options = _parse(cfg, out)
-            about = {"license": options.license, "made_with": _VERSIONS}
-            suffix, num_pairs = shard_suffix(*options.shard), options.num_pairs
-            previous = claim(
-                out, options.settings, count=num_pairs, about=about, earlier={"device": "cpu"}, suffix=suffix
-            )
+            about, suffix = {"license": options.license}, shard_suffix(*options.shard)
+            earlier = {"device": "cpu", "depth_content": options.settings.get("depth_content")}
+            claim_out(out, options.settings, count=options.num_pairs, about=about, earlier=earlier, suffix=suffix)
             options.write_list()
-        if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
-            print(f"existing pairs were made with {versions}, new ones are made with {_VERSIONS}: bytes may differ")
         with locked_shard(out, *options.shard):
             num_made, lost = _make_missing(options, out)
         _finish(options, out, num_made=num_made)
@@ -215,7 +206,7 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
         if turned := describe_turned([*paths.values()], upright=True):
             print_warning(turned)
     if (depth := depth_folder(cfg)) is not None:
-        plain |= {"depth": sources.depth_digest(depth), "depth_scale": depth.scale}
+        plain |= sources.depth_digests(depth) | {"depth_scale": depth.scale}
     scene: dict[str, Any] = {"name": str(HydraConfig.get().runtime.choices["scene"])}
     scene |= cast(dict[str, Any], OmegaConf.to_container(cfg.scene, resolve=True))
     reader = SourceReader(sources.root, plain["size"], depth, camera)

@@ -2,24 +2,29 @@
 
 import errno
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
+import cv2
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+import torchrefract
 from torchrefract._io import as_path, file_digest, is_remote
 from torchrefract._validation import UsageError, check_count, check_number, check_positive
 from torchrefract.cameras.camera import Camera
 from torchrefract.cameras.io import read_camera
+from torchrefract.cli.progress import print_warning
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.images import UnreadableImageError, center_crop
+from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.files import DamagedPairError
 from torchrefract.data.workers import num_cores
 from torchrefract.effects.base import Effect
@@ -31,6 +36,8 @@ _NUM_SEEDS = 2**32  # NumPy's limit
 # Options of tasks, and what they set.
 _OF_TASKS = {"frame_size": "data.size", "train_scenes": "data.train_count", "epochs": "trainer.max_epochs"}
 _BEST = dict.fromkeys(("psnr", "psnr_seen", "ssim"), "max") | dict.fromkeys(("loss", "L", "L_rec", "L_k", "epe"), "min")
+_VERSIONS = {"torchrefract": torchrefract.__version__, "torch": torch.__version__}
+_VERSIONS |= {"numpy": np.__version__, "opencv": cv2.__version__}
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -190,6 +197,22 @@ def place_scene(cfg: DictConfig, *, size: Sequence[int] | None = None) -> Camera
     for option, value in place.items():
         cfg.scene[option] = value
     return camera
+
+
+def claim_out(
+    out: Path, settings: Mapping[str, Any], *, about: Mapping[str, Any] | None = None, **options: Any
+) -> None:
+    """Claim an output folder as `claim` does, and note the versions of the libraries; warn if others made its files."""
+    previous = claim(out, settings, about={**(about or {}), "made_with": _VERSIONS}, **options)
+    if (versions := previous.get("made_with", _VERSIONS)) != _VERSIONS:
+        print_warning(
+            f"the files in {out} were made with {_names(versions)}, further ones are made with {_names(_VERSIONS)}: "
+            "they may differ"
+        )
+
+
+def _names(versions: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions.items())
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import TypeVar
@@ -24,14 +25,18 @@ def print_warning(message: str) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
 
-def warn_of_assumed_depth(effect: nn.Module) -> None:
-    """Print that a part of the effect assumes the depth of frames, for a command that has no depth maps."""
+def warn_of_assumed_depth(effect: nn.Module, *, option: str = "depth") -> None:
+    """Print that a part of the effect assumes the depth of frames, for a command without the option of depth maps.
+
+    The warning of the effect, which names the argument of a function, is not printed any more.
+    """
+    warnings.filterwarnings("ignore", "depth is that of a road")
     for part in effect.modules():
         source = getattr(getattr(part, "medium", part), "depth", None)
         if isinstance(source, CorridorDepth):
             print_warning(
                 f"{type(part).__name__} assumes the depth of a road between walls; depth maps, as estimate_depth "
-                "writes them, are better: depth=..."
+                f"writes them, are better: {option}=..."
             )
             return
 

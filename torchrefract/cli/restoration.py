@@ -35,6 +35,7 @@ from torchrefract.cli.evaluation import changed_values, describe_validation, use
 from torchrefract.cli.options import (
     check_seed,
     check_task_options,
+    claim_out,
     find_device,
     make,
     naming,
@@ -42,7 +43,7 @@ from torchrefract.cli.options import (
     read_option,
     read_optional,
 )
-from torchrefract.cli.progress import Skipped, batches, check_none_lost, print_warning, progress
+from torchrefract.cli.progress import Skipped, batches, check_none_lost, print_warning, progress, warn_of_assumed_depth
 from torchrefract.data.depth_maps import write_map
 from torchrefract.data.frames import FrameFolder
 from torchrefract.data.images import (
@@ -63,7 +64,6 @@ from torchrefract.data.media import (
     write_picture,
 )
 from torchrefract.data.module import PairData, fingerprint, start_method
-from torchrefract.data.pairs.configuration import claim
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.video import convert_video, video_info
@@ -169,7 +169,7 @@ def restore(cfg: DictConfig) -> None:
     if job.deviation:
         _check_maps(files, job)
     with naming("out"):
-        claim(out, _settings(cfg, job))
+        claim_out(out, _settings(cfg, job))
     with locked("out", out):
         if cfg.pool == "lens":
             job = job.with_one_lens(files, out / "camera.yaml")
@@ -209,7 +209,7 @@ def export(cfg: DictConfig) -> None:
         )
     height, width = loaded.size if cfg.size is None else _parse_size(str(cfg.size))
     interpolation = read_option(cfg, "interpolation", check_choice, choices=INTERPOLATIONS)
-    with naming("out"):
+    with naming("out"), locked("out", out.parent, out.name):
         errors = export_model(loaded, out, size=(height, width), interpolation=interpolation)
     differences = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
     print(
@@ -245,6 +245,9 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
             f"trainer must be ddp with trainer.devices={devices}{nodes} under torchrun, got one that uses "
             f"{trainer.world_size} of {processes} processes"
         )
+    has_no_depth = isinstance(data.train, FrameFolder) and data.train.depth is None
+    if has_no_depth and data.effect is not None and trainer.is_global_zero:
+        warn_of_assumed_depth(data.effect, option="data.depth")
     with naming("data"):
         data.check_ranks(trainer.world_size)
         data.check_pair()

@@ -73,7 +73,6 @@ from torchrefract.robustness.scores import (
 )
 from torchrefract.robustness.set_scores import IGNORED_CLASS
 
-_SAID_ELSEWHERE = ("depth is that of a road", "predict failed for")  # by `warn_of_assumed_depth`, and at the end
 _METRICS = {"boxes": "AP50 by image", "pixels": "IoU by image", None: "accuracy"}  # of `choose_score`, by summary
 _SETTINGS = ("model", "weights", "data", "labels", "score", "scene", "severity", "depth", "depth_scale", "seed")
 _SETTINGS += ("camera", "horizon")
@@ -155,8 +154,7 @@ def test_robustness(cfg: DictConfig) -> None:
         stored_scores(out / SCORES, settings, folder.path) as (done, store),
         warnings.catch_warnings(),
     ):
-        for message in _SAID_ELSEWHERE:
-            warnings.filterwarnings("ignore", message)  # the command prints it once
+        warnings.filterwarnings("ignore", "predict failed for")  # the command prints it once
         options = {"as_target": as_labels, "quantities": quantities, "seed": seed, "depth": folder.depth, "done": done}
         options |= {"on_scored": store, "worst_case_draws": num_draws, "batch_size": batch_size}
         result = _score(folder, predict, scenes, score, options)
@@ -177,6 +175,8 @@ def test_robustness(cfg: DictConfig) -> None:
         )
     of_set = "".join(f", {name} {value:.3f}" for name, value in result.set_scores[None].items())
     print(f"{out / 'report.html'}: {len(result.names)} pictures, clean score {result.clean.mean():.3f}{of_set}")
+    if folder.labels is None:
+        print("without labels, a score is the agreement with the prediction for the clean picture")
     _print_scenes(result, loss, num_draws)
     _print_comparison(comparison, has_labels=folder.labels is not None)
     _print_failures(result)
@@ -220,7 +220,7 @@ def _print_failures(result: Robustness) -> None:
 def _print_scenes(result: Robustness, loss: float, num_draws: int | None) -> None:
     for scene in result.scenes:
         if scene in result.quantities:
-            print(f"{scene}: {format_tolerated(result, scene, loss=loss)} for a loss of at most {loss:.0%}")
+            print(f"{scene}: {format_tolerated(result, scene, loss=loss)}")
         else:
             print(
                 f"{scene}: mean score {result.mean_performance(scene):.3f}; it has no quantity that could be tolerated"

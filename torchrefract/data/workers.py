@@ -52,7 +52,7 @@ def map_in_processes(
     pending = set[Future[_Result]]()
     try:
         for item in items:
-            with _held_interrupts():
+            with held_signal(signal.SIGINT):  # a process that is interrupted while it starts would go on
                 pending.add(pool.submit(_work, item))
             if len(pending) >= _QUEUED_ITEMS * workers:
                 done, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -109,32 +109,32 @@ def _context(preload: str) -> BaseContext:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     multiprocessing.set_forkserver_preload([preload])
-    with _interrupts(signal.SIG_IGN):  # its server would print a traceback for Ctrl-C while it imports
+    with _handled(signal.SIGINT, signal.SIG_IGN):  # its server would print a traceback for Ctrl-C while it imports
         forkserver.ensure_running()
     return multiprocessing.get_context("forkserver")
 
 
 @contextmanager
-def _held_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C until the end of the block, since a process that is interrupted while it starts would go on."""
+def held_signal(number: int) -> Iterator[None]:
+    """Hold back a signal until the end of the block."""
     received: list[int] = []
-    with _interrupts(lambda number, _: received.append(number)):
+    with _handled(number, lambda number, _: received.append(number)):
         yield
     if received:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
 
 
 @contextmanager
-def _interrupts(handler: Any) -> Iterator[None]:
-    """Handle SIGINT in another way; processes that are started ignore it too if the handler is SIG_IGN."""
+def _handled(number: int, handler: Any) -> Iterator[None]:
+    """Handle a signal in another way; processes that are started ignore it too if the handler is SIG_IGN."""
     if threading.current_thread() is not threading.main_thread():  # only there a handler can be set
         yield
         return
-    before = signal.signal(signal.SIGINT, handler)
+    before = signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
 
 
 class _Worker:

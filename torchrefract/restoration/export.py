@@ -29,7 +29,7 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
 
     Args:
         loaded: a model that restores in a single pass.
-        out: the file to write, .onnx or .pt2.
+        out: the file to write, .onnx or .pt2; no other process may write it.
         size: (height, width) of the frames, px.
         interpolation: interpolation of the warp along a predicted flow.
 
@@ -56,7 +56,7 @@ def export_model(loaded: Loaded, out: Path, *, size: tuple[int, int], interpolat
         "outputs": [*expected],
         "licenses": loaded.licenses,
     }
-    with replace_file(out) as path:
+    with replace_file(out, alone=True) as path:
         save_program(program, path, outputs=[*expected], metadata=metadata)
         return _compare(path, images, expected)
 
@@ -80,9 +80,9 @@ def save_program(
         return
     logging.getLogger("onnxscript").setLevel(logging.ERROR)  # it warns of operators that it does not optimize
     logging.getLogger("onnx_ir").setLevel(logging.WARNING)
-    exported = torch.onnx.export(
-        program, dynamo=True, input_names=[_INPUT], output_names=[*outputs], opset_version=_OPSET, verbose=False
-    )
+    names: dict[str, Any] = {"input_names": [_INPUT], "output_names": [*outputs]}
+    names["dynamic_shapes"] = {_INPUT: {0: "batch"}}  # the program itself numbers its sizes
+    exported = torch.onnx.export(program, dynamo=True, opset_version=_OPSET, verbose=False, **names)
     if exported is None:
         raise UsageError(f"out must be .pt2 for a model without operators in ONNX, got {path}")
     exported.model.metadata_props["about"] = text

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import signal
 from collections.abc import Iterable, Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
@@ -32,6 +33,7 @@ from torchrefract._io import (
 from torchrefract.data.drive_lenses import bent_drives
 from torchrefract.data.frames import FrameFolder, evenly_spaced
 from torchrefract.data.module import PairData, fingerprint
+from torchrefract.data.workers import held_signal
 from torchrefract.effects.base import Effect
 from torchrefract.effects.lens import LensDistortion
 from torchrefract.effects.warp_effect import WarpEffect
@@ -115,9 +117,12 @@ class RunSummary(Callback):
             self._examples = choose_examples(Restored(**outputs), batch)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Save the pictures; print the table and the files of the run."""
-        if not trainer.is_global_zero or not isinstance(pl_module, RestorationModule):
-            return
+        """Save the pictures; print the table and the files of the run. SIGTERM stops the program afterwards."""
+        if trainer.is_global_zero and isinstance(pl_module, RestorationModule):
+            with held_signal(signal.SIGTERM):
+                self._report(trainer, pl_module, stage)
+
+    def _report(self, trainer: Trainer, pl_module: RestorationModule, stage: str) -> None:
         if self._examples is None:
             if stage == "fit" and trainer.global_step:
                 print(self._files())

@@ -163,17 +163,29 @@ def write_report(
 
 
 def format_tolerated(result: Robustness, scene: str, *, loss: float) -> str:
-    """Describe the tolerated value of a scene, as "visibility at least 142 m [131, 155]"."""
+    """Describe what a model tolerates, as "loses at most 10% at visibility at least 142 m (95 % interval ...)"."""
+    kind, value, interval = _tolerated(result, scene, loss)
+    name, limit = result.quantities[scene].name, f"{loss:.0%}"
+    text = {
+        "none": f"loses more than {limit} even at the mildest tested value, {name} {value}",
+        "all": f"loses at most {limit} even at the strongest tested value, {name} {value}",
+    }.get(kind, f"loses at most {limit} at {name} {kind} {value}")
+    return f"{text} (95 % interval {interval})"
+
+
+def _tolerated(result: Robustness, scene: str, loss: float) -> tuple[str, str, str]:
+    """Return "at least", "at most", "all" or "none", the tolerated value with its unit, and its interval."""
     estimate, quantity = result.tolerated(scene, loss=loss), result.quantities[scene]
     values = np.concatenate([values for level, values in result.values.items() if level.scene == scene])
     mildest, strongest = (values.min(), values.max()) if quantity.is_harm else (values.max(), values.min())
-    side = "at most" if quantity.is_harm else "at least"
+    kind = "at most" if quantity.is_harm else "at least"
     if estimate.value == strongest and result.relative_performance(scene) >= 1 - loss:
-        side = "all tested, the strongest"
+        kind = "all"
     elif estimate.value == mildest:
-        side = "none tested, the mildest"
+        kind = "none"
     low, high = ("open" if math.isinf(end) else f"{end:.3g}" for end in estimate[1:])
-    return f"{quantity.name} {side} {estimate.value:.3g} {quantity.unit}".rstrip() + f" [{low}, {high}]"
+    interval = "open" if low == high == "open" else f"{low} to {high}"
+    return kind, f"{estimate.value:.3g} {quantity.unit}".rstrip(), interval
 
 
 def _flat(row: Row) -> dict[str, Any]:
@@ -231,9 +243,10 @@ def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
 def _tolerated_cells(result: Robustness, loss: float) -> list[tuple[str, ...]]:
     cells = []
     for scene, quantity in result.quantities.items():
-        text = format_tolerated(result, scene, loss=loss).removeprefix(quantity.name)
-        value, _, interval = text.partition("[")
-        cells.append((scene, value.strip(), interval.rstrip("]").replace(",", " to"), quantity.name))
+        kind, value, interval = _tolerated(result, scene, loss)
+        texts = {"none": f"none tested, not even {value}", "all": f"all tested, even {value}"}
+        text = texts.get(kind, f"{kind} {value}")
+        cells.append((scene, text, interval, quantity.name))
     others = [scene for scene in result.scenes if scene not in result.quantities]
     return cells + [(scene, "", "", "none, see the scores by severity") for scene in others]
 

@@ -70,6 +70,15 @@ def test_frames_without_edges_give_no_distortion_and_say_so():
     assert result.warnings[1].startswith("the lens cannot be distinguished from no distortion")
 
 
+def test_a_lens_that_is_as_vague_as_it_is_strong_is_warned_of():
+    result = estimate_lens(blank(4), predict=lambda frame: flow_of(-0.3, 0.05))
+    assert result.is_distorted
+    assert result.edge_px > 0.1 * WIDTH
+    assert result.warnings[-1].startswith(
+        f"the lens is vague: the rectified position has a standard deviation of {result.edge_px:.0f} px, more than 2% "
+    )
+
+
 def test_the_field_of_view_scales_the_coefficients_and_leaves_the_mapping(drive):
     frames = drive((-0.16, 0.06), 6)[:2]
     narrow, wide = (estimate_lens(frames, fov_deg=angle) for angle in (40.0, 110.0))

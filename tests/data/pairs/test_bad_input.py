@@ -154,7 +154,7 @@ def test_a_set_of_another_version_of_torchrefract_is_continued_with_a_word(call,
     path.write_text(path.read_text().replace(f'"torchrefract": "{torchrefract.__version__}"', '"torchrefract": "0.0"'))
     outcome = call("generate", *words("out", "count=1"))
     assert outcome.code == 0
-    assert "existing pairs were made with {'torchrefract': '0.0', " in outcome.out
+    assert "warning: the files in out were made with torchrefract 0.0, torch " in outcome.err
 
 
 def test_a_read_only_folder_raises(call, words, disk):

@@ -24,6 +24,7 @@ from torchrefract.cameras.calibration.uncertainty import rectified_deviation
 from torchrefract.cameras.camera import UNKNOWN_FOCAL, Camera
 
 _MIN_STRAIGHT = 10  # chains
+_VAGUE = 0.02  # widths of the frame; standard deviation from which a lens is warned of
 _FLOW_GRID = 33  # points along each side of the frame to which a camera is fitted
 
 
@@ -183,6 +184,11 @@ def _to_estimate(chains: Chains, prior: Gaussian, num_frames: int, focal: float)
     if not fit.is_distorted:
         warnings.append(
             "the lens cannot be distinguished from no distortion (95 %): add frames, or calibrate with a board"
+        )
+    elif (deviation := np.nanmax([edge_px, corner_px, 0.0])) > _VAGUE * width:
+        warnings.append(
+            f"the lens is vague: the rectified position has a standard deviation of {deviation:.0f} px, more than "
+            f"{_VAGUE:.0%} of the width; add frames with straight edges near the border, or calibrate with a board"
         )
     return LensEstimate(
         camera=camera,

@@ -86,6 +86,9 @@ class PairedFolder(Dataset[Pair]):
         row = self.row(index)
         return self.decode(row, {suffix: partial(read_stored, self.root, file) for suffix, file in row.files.items()})
 
+    def _origin(self, row: PairRow) -> str:
+        return f"pair {row.number} of the scene {row.scene} in {self.root}"
+
     def decode(self, row: PairRow, files: Mapping[str, Callable[[], bytes]]) -> Pair:
         """Make a pair of its row and of functions that read its files, by suffix."""
         try:
@@ -100,9 +103,9 @@ class PairedFolder(Dataset[Pair]):
                 "verify=true makes it again"
             ) from error
         if self.transmission and _TRANSMISSION not in arrays.maps:
-            raise ValueError(f"root must hold pairs with a transmission, as of fog, got {row.number} in {self.root}")
+            raise ValueError(f"root must hold pairs with a transmission, as of fog, got {self._origin(row)} without")
         if self.flow and _FLOW not in arrays.maps:
-            raise ValueError(f"root must hold pairs with a flow, as of a lens, got {row.number} in {self.root}")
+            raise ValueError(f"root must hold pairs with a flow, as of a lens, got {self._origin(row)} without")
         size = arrays.clean.shape[:2]
         flow = arrays.maps.get(_FLOW, np.zeros((2, *size), np.float32))
         valid = arrays.maps[_VALID] if _FLOW in arrays.maps else np.ones(size, dtype=bool)

@@ -21,7 +21,7 @@ from torchrefract.data.video import video_info
 from torchrefract.random import key_of
 
 LIST = "sources.parquet"  # the list in the folder of a set
-_SAMPLES = 16  # images whose headers are read before a set is started
+_SAMPLES = 16  # images whose headers are read, and depth maps that are compared, before a set is started
 _BATCH = 10_000  # rows that are Python objects at a time
 
 
@@ -64,16 +64,21 @@ class Sources(NamedTuple):
             digest.update(ascii([*frame]).encode())
         return digest.hexdigest()
 
-    def depth_digest(self, depth: DepthFolder) -> str:
-        """Return a SHA-256 digest of the names and sizes of the depth maps.
+    def depth_digests(self, depth: DepthFolder) -> dict[str, str]:
+        """Return SHA-256 digests of the names and sizes of the depth maps, and of the bytes of 16 of them.
+
+        Other maps in .npy have the same sizes. To read all of a large set would take minutes.
 
         Raises:
             UsageError: a frame has none, or two frames share one.
         """
-        digest = hashlib.sha256()
-        for path in depth.check((frame.path, frame.frame) for frame in self.frames()):
-            digest.update(ascii([path.name, depth.size_bytes(path)]).encode())
-        return digest.hexdigest()
+        names, content = hashlib.sha256(), hashlib.sha256()
+        paths = depth.check((frame.path, frame.frame) for frame in self.frames())
+        for path in paths:
+            names.update(ascii([path.name, depth.size_bytes(path)]).encode())
+        for index in evenly_spaced(len(paths), _SAMPLES):
+            content.update(read_bytes(paths[index]))
+        return {"depth": names.hexdigest(), "depth_content": content.hexdigest()}
 
     def write(self, path: Path, options: dict[str, Any]) -> None:
         """Write the list and the options of its scan as a Parquet file."""

@@ -15,7 +15,7 @@ from stores import digests
 
 import torchrefract
 from torchrefract.data.pairs.dataset import PairedFolder
-from torchrefract.data.pairs.files import DamagedPairError
+from torchrefract.data.pairs.files import DamagedPairError, encode_maps
 
 
 @pytest.fixture
@@ -66,6 +66,13 @@ def test_a_license_and_a_scene_are_required(call, words):
     for name, message in (("license", "license must be given, as in license=…, got nothing"), ("scene", "'scene'")):
         without = [word for word in words("out", scene="paper_weather") if not word.startswith(name)]
         assert message in call("generate", *without).message
+
+
+def test_light_that_a_png_cannot_hold_names_the_formats_that_hold_it():
+    light = {"intensity": np.full((4, 6), 3.0, np.float32)}
+    with pytest.raises(ValueError, match="maps must be npz or safetensors for intensity above 2, got up to 3"):
+        encode_maps(light, "png")
+    assert list(encode_maps(light, "npz")) == ["maps.npz"]
 
 
 def test_a_folder_of_another_configuration_raises_with_the_differences(call, words, tmp_path):

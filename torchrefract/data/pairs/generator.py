@@ -170,7 +170,7 @@ class PairGenerator(NamedTuple):
         try:
             data = encode_pair(pair, self.maps)
         except ValueError as error:
-            raise UsageError(f"maps: {error}") from error
+            raise UsageError(str(error)) from error
         row = row._replace(
             height=image.shape[1],
             width=image.shape[2],

@@ -150,7 +150,9 @@ def test_a_training_and_its_validation_have_the_camera_of_the_cropped_frames(cal
     assert "rotation of a video): a.png. They are read as displayed, and so labels and a camera must be" in again.err
     shutil.copy(folder / "frames" / "a.png", folder / "drives" / "v")
     wider = ("trainer.max_epochs=2", "model.network.width=8", "ckpt_path=run/last.ckpt")
-    assert "got run/last.ckpt, where " in call("train", *options, *PLACE, *wider).message
+    other = call("train", *options, *PLACE, *wider)
+    assert (other.code, "got run/last.ckpt, where " in other.err) == (1, True)
+    assert "HeterogeneousFog assumes the depth of a road between walls" in other.err
     write_camera(folder / "camera.yaml", 32, 64)
     assert "camera must be that of all frames, got drives/v/a.png" in call("train", *options, *PLACE).message
     message = call("train", "+task=deweather", *PLACE).message

@@ -145,7 +145,7 @@ def test_the_number_of_frame_sizes_of_a_graph_is_the_recompile_limit_of_pytorch(
                     compiled(images[limit])
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning is not what is tested
 def test_effects_of_one_class_with_other_numbers_have_a_graph_each():
     image = random_image(1, 3, 12, 16)
     for fx in (15.0, 17.0):  # torch.compile makes a symbol of a number that differs

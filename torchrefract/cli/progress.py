@@ -28,12 +28,12 @@ def print_warning(message: str) -> None:
 def warn_of_assumed_depth(effect: nn.Module, *, option: str = "depth") -> None:
     """Print that a part of the effect assumes the depth of frames, for a command without the option of depth maps.
 
-    The warning of the effect, which names the argument of a function, is not printed any more.
+    It takes the place of the warning of the effect, which names the argument of a function.
     """
-    warnings.filterwarnings("ignore", "depth is that of a road")
     for part in effect.modules():
         source = getattr(getattr(part, "medium", part), "depth", None)
         if isinstance(source, CorridorDepth):
+            warnings.filterwarnings("ignore", "depth is that of a road")  # the line below says it once
             print_warning(
                 f"{type(part).__name__} assumes the depth of a road between walls; depth maps, as estimate_depth "
                 f"writes them, are better: {option}=..."

@@ -210,17 +210,44 @@ def test_several_processes_with_a_trainer_of_one_raise(call, trained, monkeypatc
     assert message.startswith("trainer must be ddp with trainer.devices=1 and trainer.num_nodes=2 under torchrun, got")
 
 
-def test_a_training_in_two_processes_stops_on_sigterm_with_its_last_checkpoint(small, tmp_path):
-    path = tmp_path / "run" / "last.ckpt"
+STOPPED = """
+import os, signal, time
+from pathlib import Path
+from torchrefract.restoration.module import Restoration
+from torchrefract.train import main
+
+step = Restoration.training_step
+
+def recorded_step(self, batch, index):
+    with Path(f"keys{self.global_rank}.txt").open("a") as file:
+        print(self.current_epoch, *batch.key.tolist(), file=file)
+    if self.global_step == 2 and self.trainer.is_global_zero and not Path("run/stopped").exists():
+        Path("run/stopped").touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1)  # the other process waits for the gradients of this one
+    return step(self, batch, index)
+
+Restoration.training_step = recorded_step
+main()
+"""
+
+
+def test_a_training_in_two_processes_stops_on_sigterm_in_one_step_and_continues_at_the_next(small, tmp_path):
+    (tmp_path / "stopped.py").write_text(STOPPED)
     words = ("+task=undistort", *small, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "run_dir=run")
-    with running("-m", "torchrefract.train", *words, "trainer.max_epochs=1000", cwd=tmp_path) as process:
-        wait_for(path.exists, process)
-        process.terminate()
-        _, message = process.communicate(timeout=60)
+    with running("stopped.py", *words, cwd=tmp_path) as process:
+        _, message = process.communicate(timeout=120)
     assert process.returncode == 143, message
     (line,) = (line for line in message.splitlines() if line.startswith("stopped by SIGTERM"))
-    assert line.endswith("ckpt_path=run/last.ckpt continues")
-    assert read_checkpoint(path, task="undistort")["global_step"] >= 2
+    assert line == "stopped by SIGTERM in step 3; ckpt_path=run/last.ckpt continues"
+    assert read_checkpoint(tmp_path / "run" / "last.ckpt", task="undistort")["global_step"] == 3
+    with running("stopped.py", *words, "ckpt_path=run/last.ckpt", cwd=tmp_path) as process:
+        _, message = process.communicate(timeout=120)
+    assert process.returncode == 0, message
+    lines = [line.split() for rank in range(2) for line in (tmp_path / f"keys{rank}.txt").read_text().splitlines()]
+    batches = [(epoch, key) for epoch, *keys in lines for key in keys]
+    assert len({key for _, key in batches}) == 8
+    assert sorted(batches) == sorted({(epoch, key) for epoch in "01" for _, key in batches})
 
 
 def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):

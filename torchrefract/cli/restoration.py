@@ -138,7 +138,8 @@ def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Tra
     try:
         trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SIGTERMException:
-        raise SystemExit(128 + signal.SIGTERM) from None
+        # Lightning kills its first process, which may still write, once another one has ended with an error.
+        raise SystemExit(128 + signal.SIGTERM if trainer.is_global_zero else 0) from None
     except MisconfigurationException as error:
         raise UsageError(f"trainer: {error}") from error
     except SystemExit as error:  # Lightning turns Ctrl-C into the status 1

@@ -69,8 +69,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 class StopOnSigterm(Callback):
     """Stop a training on SIGTERM between two steps, with a checkpoint that continues at the next one.
 
-    A validation is completed first, and so is a step that accumulates gradients. A training on several devices keeps
-    the checkpoint of its last epoch, because its processes receive the signal in different steps.
+    A validation is completed first, and so is a step that accumulates gradients. The processes of a training on several
+    devices stop behind the same step, whichever of them receives the signal.
 
     Args:
         run_dir: the run folder, whose last.ckpt the callback replaces.
@@ -81,29 +81,26 @@ class StopOnSigterm(Callback):
         self._is_pending = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Delay the signal until the end of a validation or of a step, as no checkpoint holds the state within."""
-        self._forward = signal.getsignal(signal.SIGTERM)
+        """Receive the signal instead of Lightning, whose processes would wait for each other within a step."""
 
         def receive(number: int, frame: Any) -> None:
-            if trainer.validating or trainer.accumulate_grad_batches > 1:
-                self._is_pending = True
-            elif callable(self._forward):
-                self._forward(number, frame)
+            self._is_pending = True
 
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, receive)  # Lightning restores the handler of the caller
 
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Let Lightning stop behind this batch if a process has received the signal."""
+        is_last = (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
+        if is_last and trainer.strategy.reduce_boolean_decision(self._is_pending, all=False):
+            self._is_pending, trainer._signal_connector.received_sigterm = False, True
+
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Delay a signal of the last step, too."""
+        """Complete the validation, within which Lightning would stop."""
         if trainer.received_sigterm:
             self._is_pending, trainer._signal_connector.received_sigterm = True, False
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Deliver a delayed signal, on which Lightning stops after this batch."""
-        is_last = (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
-        if self._is_pending and is_last and callable(self._forward):
-            self._is_pending = False
-            self._forward(signal.SIGTERM, None)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Write the checkpoint, and say how to continue."""
@@ -111,7 +108,7 @@ class StopOnSigterm(Callback):
             return
         epochs: Any = trainer.fit_loop.epoch_progress.current
         # At the end of an epoch, the checkpoint exists already.
-        if trainer.world_size == 1 and epochs.processed < epochs.ready:
+        if epochs.processed < epochs.ready:
             trainer.save_checkpoint(str(self.path))
         if trainer.is_global_zero:
             print(f"stopped by SIGTERM in step {trainer.global_step}; {how_to_continue(self.path)}", file=sys.stderr)

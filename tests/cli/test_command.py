@@ -63,6 +63,9 @@ def run_main(monkeypatch, capsys):
     return run_function
 
 
+CLOSED = "[gloo/transport/tcp/pair.cc:561] Connection closed by peer [127.0.0.1]:7."
+
+
 @pytest.mark.quick
 def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_main, capsys):
     def fail(error: Exception) -> None:
@@ -79,6 +82,7 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
             RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "),
             "data.workers must fit the memory, got one that ended (DataLoader worker (pid 7) is killed by signal: Kill",
         ),
+        (RuntimeError(CLOSED), "another process of the training has ended: it printed why, or was killed, as for"),
     ):
         with pytest.raises(SystemExit) as stop:
             run_main(lambda error=error: fail(error))
@@ -86,6 +90,22 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
         assert capsys.readouterr().err.startswith(f"error: {message}")
     with pytest.raises(TypeError, match="not callable"):
         run_main(lambda: fail(TypeError("'int' object is not callable")))
+
+
+@pytest.mark.quick
+def test_only_the_first_process_of_a_training_says_that_another_has_ended_or_that_it_was_interrupted(
+    run_main, capsys, monkeypatch
+):
+    for error, code in ((RuntimeError(CLOSED), 1), (KeyboardInterrupt(), 130)):
+        for rank in range(2):
+
+            def fail(error: BaseException = error) -> None:
+                raise error
+
+            monkeypatch.setenv("LOCAL_RANK", str(rank))
+            with pytest.raises(SystemExit) as stop:
+                run_main(fail)
+            assert (stop.value.code, len(capsys.readouterr().err.splitlines())) == (code, 1 - rank)
 
 
 @pytest.mark.quick

@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import os
 import signal
 import sys
 import textwrap
@@ -46,11 +47,17 @@ def command(name: str, page: str | None, function: str, *, has_sweeps: bool = Tr
             print(f"error: {message}", file=sys.stderr)
             raise SystemExit(1) from error
         except KeyboardInterrupt:
-            print("stopped", file=sys.stderr)
+            if is_first_process():
+                print("stopped", file=sys.stderr)
             raise SystemExit(128 + signal.SIGINT) from None
         run(name, job)
 
     return main
+
+
+def is_first_process() -> bool:
+    """Return True in the first of the processes that Lightning or torchrun starts on a machine, and without those."""
+    return os.environ.get("LOCAL_RANK", "0") == "0"
 
 
 def missing_library(error: ModuleNotFoundError, name: str) -> str | None:

@@ -331,7 +331,7 @@ def test_a_run_that_fails_leaves_no_empty_folder_but_those_that_existed(call, tm
         assert call("train", "+task=undistort", *frames, *words).code == 1
     several = call("train", "-m", "+task=undistort", *frames, "seed=1,2")
     assert several.code == 1
-    assert "root must be a folder of frames" in several.message
+    assert several.err.count("root must be a folder of frames") == len(several.err.splitlines()) == 2
     assert call("calibrate", "images=none", "out=a/camera").code == 1
     assert call("rectify", "input=none", "camera=none", "out=a/rectified").code == 1
     assert call("generate", "scene=paper_weather", "source=none", "out=a/pairs", "license=CC0").code == 1
@@ -386,6 +386,12 @@ def test_a_multirun_has_a_folder_for_each_job(call, small, tmp_path):
     assert (outcome := call("train", *words)).code == 0, outcome.err
     for job, seed in enumerate((3, 4)):
         assert OmegaConf.select(OmegaConf.load(tmp_path / f"sweep/{job}/config.yaml"), "data.seed") == seed
+
+
+def test_a_job_of_a_multirun_that_fails_does_not_stop_the_others(call, small, tmp_path):
+    words = ("-m", "+task=undistort", *small, "trainer.max_epochs=0", "model.lr=-1,0.1", "hydra.sweep.dir=sweep")
+    assert call("train", *words).message == "model: lr must be a number of at least 0, got -1"
+    assert [path.name for path in tmp_path.glob("sweep/*/config.yaml")] == ["config.yaml"]
 
 
 # --- frames

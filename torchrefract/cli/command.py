@@ -79,11 +79,17 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
         name: of the module, and of its file in conf.
         function: called with the configuration.
     """
+    is_multirun, failed = any(argument in _MULTIRUN for argument in sys.argv), list[SystemExit]()
 
     def job(cfg: DictConfig) -> None:
-        with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
-            function(cfg)
-            sys.stdout.flush()
+        try:
+            with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
+                function(cfg)
+                sys.stdout.flush()
+        except SystemExit as stop:
+            if not is_multirun or stop.code != 1 or isinstance(stop.__context__, BrokenPipeError):
+                raise
+            failed.append(stop)  # as Hydra does, go on with the other runs
 
     job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
@@ -97,6 +103,8 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
         _check_addresses(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
+    if failed:
+        raise failed[0]
 
 
 def _check_addresses(name: str, arguments: list[str]) -> None:

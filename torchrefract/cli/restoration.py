@@ -272,7 +272,7 @@ def _check_camera(camera: Camera, data: PairData) -> None:
         for frame in first:
             height, width = image_size(frame)
             check_frame_of_camera(camera, str(frame), height=height, width=width)
-        if turned := describe_turned(first, upright=True):
+        if (turned := describe_turned(first, upright=True)) and is_first_process():
             print_warning(turned)
 
 

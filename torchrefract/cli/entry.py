@@ -47,8 +47,7 @@ def command(name: str, page: str | None, function: str, *, has_sweeps: bool = Tr
             print(f"error: {message}", file=sys.stderr)
             raise SystemExit(1) from error
         except KeyboardInterrupt:
-            if is_first_process():
-                print("stopped", file=sys.stderr)
+            print("stopped", file=sys.stderr)
             raise SystemExit(128 + signal.SIGINT) from None
         run(name, job)
 

@@ -3,6 +3,7 @@
 import math
 import os
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
@@ -219,7 +220,10 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
-    data, model = make(cfg, "data"), make(cfg, "model")
+    with warnings.catch_warnings():
+        if not is_first_process():
+            warnings.simplefilter("ignore", UserWarning)  # those of the first process, which reads the same files
+        data, model = make(cfg, "data"), make(cfg, "model")
     if camera is not None:
         _check_camera(camera, data)
     try:

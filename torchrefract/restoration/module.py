@@ -175,7 +175,7 @@ class RestorationModule(LightningModule, ABC):
     def num_steps(self) -> float:
         """Return the steps of the training, of which those before a resume may be of other batches."""
         steps = self.trainer.estimated_stepping_batches
-        if math.isinf(steps) or self.trainer.max_steps != -1:
+        if math.isinf(self.trainer.num_training_batches) or self.trainer.max_steps != -1:  # it may load no data
             return steps
         epochs, made = self.resumed
         return steps + made - epochs * self.steps_per_epoch
@@ -247,8 +247,9 @@ class RestorationModule(LightningModule, ABC):
             pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
             kept = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
             mean = kept.mean() if len(kept) else torch.zeros((), device=value.device)  # of weight 0
-            options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
-            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(kept), **options)
+            # Lightning averages the number over processes in its type, and would round an integer down.
+            options: dict[str, Any] = {"batch_size": float(len(kept)), "on_step": False, "on_epoch": True}
+            self.log(f"{split}/{name}{suffix}", mean, sync_dist=True, **options)
 
 
 class Restoration(RestorationModule):

@@ -90,10 +90,10 @@ class SunGlare(PhotometricEffect):
     G = (mean of the clean frame / mean with the sun)^gamma, see `Exposure`. `intensity` is the mean of v over the
     channels; `valid` are the pixels that do not saturate.
 
-    By default the sun stands at a random point of the sky that the frame shows, see `sky_mask`. In a share
-    `outside` of the frames, and in those without sky, it stands above the frame, from where it sends glare but no disk
-    and no ghosts; they fade while the disk leaves the frame. At night there is none: the drawn luminance is 0. For a clip, its first frame counts; so to degrade
-    a clip in parts, pass the params of the first part to `apply`.
+    By default the sun stands at a random point of the sky that the frame shows, see `sky_mask`. In a share `outside` of
+    the frames, and in those without sky, it stands above the frame, from where it sends glare but no disk and no
+    ghosts; they fade while the disk leaves the frame. At night there is none: the drawn luminance is 0. For a clip, its
+    first frame counts; so to degrade a clip in parts, pass the params of the first part to `apply`.
 
     Args:
         center_x_range, center_y_range: of the sun, in widths and heights from the upper left corner of the frame; both

@@ -14,6 +14,7 @@ from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
+_DUSK = (0.03, 0.07)  # `Sky.darkness` around that of the night: `end` changes slowly in a clip
 _TALL = 2.5  # heights, of a tree or a mast that hangs over the sky
 _POLE = 0.03  # widths: narrower things in front of the sky hide no skyline; it is smoothed alike
 
@@ -31,9 +32,9 @@ class CorridorDepth:
     to y_s(x), what stands below it ends there: if it is h high, it is z_skyline away. So open land has no walls. Trees
     and masts that hang over that sky are 2.5 h high at most, so that their tops are near. A column without sky has no
     z_skyline, and by day a frame without sky looks at something near, such as trees or the road itself: `end` is `far`,
-    or min(`far`, `closed`) there; 1 / end is linear between the two in frames of which the sky takes less than a tenth.
-    y_s is the lowest row of the sky around a column. Pass it as `depth=` to a fog; a depth map, or a network
-    (`torchrefract.depth.from_transformers`), is better.
+    or min(`far`, `closed`) there; 1 / end is linear between the two in frames of which the sky takes less than a tenth,
+    or a dark sky 3 to 7 %. y_s is the lowest row of the sky around a column. Pass it as `depth=` to a fog; a depth map,
+    or a network (`torchrefract.depth.from_transformers`), is better.
 
     Numbers out of range raise ValueError.
 
@@ -102,7 +103,8 @@ class CorridorDepth:
         r2 = (x - (self.vanishing * width - 0.5)).square() + above.square()[:, None]
         mask = sky_mask(image)
         seen = (mask.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
-        seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
+        night = (find_sky(image).darkness - _DUSK[0]) / (_DUSK[1] - _DUSK[0])
+        seen = torch.maximum(seen, night.clamp(0, 1).to(dtype)).view(-1, 1, 1, 1)
         end = seen / self.far + (1 - seen) / min(self.far, self.closed)
         walls = (r2 / (self.side * self.focal * width) ** 2 + end.square()).rsqrt()
         walls = torch.maximum(walls, self._skyline(mask, y))

@@ -94,7 +94,7 @@ class CorridorDepth:
         if not torch.compiler.is_compiling():
             warn(
                 "depth is that of a road between walls; pass depth=, a map in m or torchrefract.depth."
-                "from_transformers(...), for fog that knows what stands where"
+                "from_transformers(...), for fog that knows what stands where, or horizon= if the camera looks down"
             )
         height, width = image.shape[2:]
         dtype, device = field_dtype(image.dtype), image.device

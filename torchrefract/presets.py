@@ -132,6 +132,7 @@ def night_fog(
     of_glow: dict[str, Any] = {
         "optical_depth_range": (3 * _NEAR_LAMP / high, 3 * _FAR_LAMP / low),
         "luminance_range": (0.2 * _LAMP_LUMINANCE, 0.6 * _LAMP_LUMINANCE),
+        "threshold": 0.88,  # above most white paint in the light of headlamps
         "camera": _camera(camera),
     }
     fog = _morning_fog(visibility, camera, horizon, depth, lamps | arguments)

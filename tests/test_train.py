@@ -113,7 +113,7 @@ def test_a_training_on_frames_without_depth_maps_names_its_option(call, small, t
     assert outcome.code == 0
     assert outcome.err == (
         "warning: HeterogeneousFog assumes the depth of a road between walls; depth maps, as estimate_depth writes "
-        "them, are better: data.depth=...\n"
+        "them, are better: data.depth=...; a camera that looks down needs horizon=..., taken as 0.55\n"
     )
 
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torchrefract._io import make_writable_folder, replace_file, write_figure, write_file
-from torchrefract._validation import UsageError, check_choice, check_number
+from torchrefract._validation import UsageError, check_choice, check_number, first_names
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
 from torchrefract.cameras.calibration.detection import (
@@ -266,6 +266,10 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 def _print_summary(calibration: Calibration, out: Path) -> None:
     for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
+    if unused := [
+        f"{detection.view.name} ({detection.problem})" for detection in calibration.detections if detection.problem
+    ]:
+        print(f"not used: {first_names(unused)}")
     if calibration.fit.rms > _HIGH_RMS * calibration.fit.camera.width:
         print_warning(
             f"an error of {calibration.fit.rms:.2f} px rms is high: the board may be bent, or the pictures of several "

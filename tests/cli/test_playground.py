@@ -140,6 +140,19 @@ def test_without_gradio_the_error_names_the_extra():
     assert missing_library(error, "playground") == expected
 
 
+_SHOW = """from torchrefract.cli.playground import make_page
+show = next(of.fn for of in make_page({}, max_side=96).fns.values() if of.name == "show")
+print(show(None, None, "Vignetting", 3, None, None)[3])
+"""
+
+
+def test_an_empty_number_is_0_so_that_the_copied_code_makes_the_picture(spawn, tmp_path):
+    pytest.importorskip("gradio", reason="gradio is in the extra playground")
+    code = spawn("-c", _SHOW, cwd=tmp_path).out
+    assert "torch.tensor([0])" in code
+    assert "seed=0, keys=[0]" in code
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -102,6 +102,7 @@ def make_page(table: Sliders, *, max_side: int) -> gr.Blocks:
         return config_of(choice, severity=severity, width=width)
 
     def show(path: str | None, road: int, choice: str, severity: int, seed: int, key: int, *positions: float) -> Any:
+        road, seed, key = (number or 0 for number in (road, seed, key))  # None for an empty field
         try:
             chosen = config(choice, severity, path)
             if positions:

@@ -128,7 +128,9 @@ def make_page(table: Sliders, *, max_side: int) -> gr.Blocks:
                     with gr.Tab("Python"):
                         code = gr.Code(language="python", label="Python code of the picture", elem_id="code")
                     with gr.Tab("YAML"):
-                        yaml = gr.Code(language="yaml", label="YAML of the effect, as in conf/scene")
+                        yaml = gr.Code(
+                            language="yaml", label="YAML, as DIR/scene/NAME.yaml for --config-dir DIR scene=NAME"
+                        )
             with gr.Column(scale=1, min_width=320, elem_classes="controls"):
                 path = gr.File(label="JPEG, PNG, WebP or BMP up to 50 MB", height=160)
                 road = gr.Number(0, label="without a picture, number of the rendered road", precision=0, minimum=0)

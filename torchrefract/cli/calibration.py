@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import make_writable_folder, replace_file, write_figure, write_file
+from torchrefract._io import make_folder, make_writable_folder, replace_file, write_figure, write_file
 from torchrefract._validation import UsageError, check_choice, check_number, first_names
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
@@ -79,6 +79,7 @@ def make_board(cfg: DictConfig) -> None:
     if out.suffix.lower() not in _BOARD_FORMATS:
         raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
     try:
+        make_folder(out.parent)
         write_figure(out, board_page(board, margin_mm=margin), dpi=dpi)
     except OSError as error:
         raise UsageError(f"{out} could not be written: {error.strerror}") from error

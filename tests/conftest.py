@@ -409,7 +409,7 @@ def brighter(known_model) -> Path:
 @pytest.fixture
 def call(monkeypatch, tmp_path, capsys, on_threads) -> Iterator[Callable[..., Outcome]]:
     """Return a function that runs a command in this process, on one thread, in the folder of the test."""
-    for name in ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS"):
+    for name in ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS", "TORCHREFRACT_FIRST_PROCESS"):
         monkeypatch.setenv(name, "")  # restored after the test
     monkeypatch.chdir(tmp_path)
     on_threads(1)

@@ -292,6 +292,27 @@ def test_walls_are_as_far_away_as_the_sky_above_them_is_low():
     assert_close(depth[0, 0, 110, 190], torch.tensor(1.3 * 200 / 51.0), rtol=0.02, atol=0)  # the road hides the wall
 
 
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
+def test_a_tree_that_hangs_over_the_sky_is_as_near_as_one_of_two_and_a_half_heights():
+    image = torch.full((1, 3, 120, 200), 0.2)
+    image[:, :, :51] = 0.9
+    image[:, :, 3:30, 150:170] = 0.2  # a crown, with the sky above and below it
+    depth = CorridorDepth(side=1.0, focal=1.0, spread=0.0, height=6.0)(image)
+    assert_close(depth[0, 0, 10, 160], torch.tensor(200 * (2.5 * 6.0 - 1.3) / (59.5 - 10)))
+    assert_close(depth[0, 0, 55, 160], torch.tensor(200 * (6.0 - 1.3) / (59.5 - 50)))
+
+
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
+def test_the_end_of_a_frame_without_sky_moves_slowly_as_its_top_darkens():
+    image = 0.35 + 0.5 * torch.rand(21, 3, 120, 192, generator=torch.Generator().manual_seed(0))
+    for i, frame in enumerate(image):
+        frame[:, : i // 2] = 0.15  # smooth and dark: that of a night from 5 % on
+    depth = CorridorDepth(side=1e4, horizon=0.9)(image)[:, 0, 60, 96]
+    assert depth[0] == pytest.approx(30, rel=0.01)
+    assert depth[-1] == pytest.approx(300, rel=0.01)
+    assert (1 / depth[:-1] - 1 / depth[1:]).max() < 0.5 * (1 / depth[0] - 1 / depth[-1])
+
+
 def test_the_walls_stand_where_they_should_and_the_depth_is_announced_as_assumed():
     with pytest.warns(UserWarning, match="pass depth="):
         depth = CorridorDepth(side=6.0, focal=1.0, spread=0.0, far=1e9)(torch.zeros(1, 3, 100, 200))

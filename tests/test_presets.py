@@ -170,6 +170,10 @@ def test_lamps_shine_through_fog_at_night_in_a_glow():
     assert (foggy[..., 31, 81] > 0.95).all()
     assert (foggy[..., 31, 21] < 0.5).all()
     assert (foggy[..., 31, 86] > 1.5 * foggy[..., 80, 86]).all()  # around the lamp
+    far = presets.night_fog(4).degrade(frame, seed=1, depth=4 * depth)  # a lamp is seen farther away than the road
+    assert 2 * far.params.children[0].visibility < 120
+    assert (far.image[..., 31, 81] > 0.95).all()
+    assert (far.image[..., 31, 21] < 0.3).all()
     day = torch.full((1, 3, 90, 160), 0.7)
     day[:, :, 60:] = 0.3
     day[:, :, 70:73, 80:83] = 1.0

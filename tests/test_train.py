@@ -113,7 +113,7 @@ def test_a_training_on_frames_without_depth_maps_names_its_option(call, small, t
     assert outcome.code == 0
     assert outcome.err == (
         "warning: HeterogeneousFog assumes the depth of a road between walls; depth maps, as estimate_depth writes "
-        "them, are better: data.depth=...\n"
+        "them, are better: data.depth=...; a camera that looks down needs horizon=..., taken as 0.55\n"
     )
 
 
@@ -250,6 +250,39 @@ def test_a_training_in_two_processes_stops_on_sigterm_in_one_step_and_continues_
     assert sorted(batches) == sorted({(epoch, key) for epoch in "01" for _, key in batches})
 
 
+def test_a_process_of_a_training_ends_when_the_first_one_is_killed_while_it_loads(small, tmp_path):
+    words = ("+task=undistort", *small, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "run_dir=run")
+    with running("-m", "torchrefract.train", *words, cwd=tmp_path) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        wait_for(lambda: "train_ddp_process_1" in commands(children.read_text().split()), process)
+        process.kill()
+        process.communicate(timeout=120)  # ends with the last process
+
+
+def commands(processes: list[str]) -> str:
+    """Return the command lines of processes."""
+    return " ".join(path.read_text() for number in processes if (path := Path(f"/proc/{number}/cmdline")).exists())
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [
+        (signal.SIGTERM, "stopped by SIGTERM; the same command starts again\n"),
+        (signal.SIGINT, "stopped; the same command starts again\n"),
+    ],
+)
+def test_an_evaluation_that_is_stopped_has_the_status_of_the_signal(call, trained, monkeypatch, number, message):
+    step = Restoration.validation_step
+
+    def stop(self, batch, index):
+        os.kill(os.getpid(), number)
+        return step(self, batch, index)
+
+    monkeypatch.setattr(Restoration, "validation_step", stop)
+    outcome = call("eval", f"ckpt_path={trained.folder / 'best.ckpt'}", "data.workers=0", "data.batch_size=1")
+    assert (outcome.code, outcome.err) == (128 + number, message)
+
+
 def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):
     # Not forked from the tests: a forked process could wait forever for threads of its parent.
     words = ("+task=undistort", *small, "run_dir=run", "trainer.max_epochs=1000", "data.workers=1")
@@ -298,14 +331,40 @@ def test_a_resumed_run_keeps_its_optimizer(call, trained, word, stored):
     assert not Path("run").exists()
 
 
-@pytest.mark.parametrize("word", ["data.val_count=2", "data.batch_size=4"])
-def test_a_resumed_run_warns_of_other_values(call, trained, word):
+@pytest.mark.parametrize(("word", "steps"), [("data.val_count=2", 12), ("data.batch_size=4", 10)])
+def test_a_resumed_run_warns_of_other_values_and_ends_at_a_learning_rate_of_zero(call, trained, word, steps):
     words = (f"ckpt_path={trained.folder / 'last.ckpt'}", "trainer.max_epochs=3", word, "run_dir=run")
     outcome = call("train", *trained.words, *words)
     assert outcome.code == 0
     warning, *rest = outcome.err.splitlines()
     assert warning == f"warning: the training continues with other values than before of {word.partition('=')[0]}"
     assert not rest
+    assert re.search(rf"^steps +{steps} in 3 epochs of {steps - 8}, ", outcome.out, re.MULTILINE), outcome.out
+    (schedule,) = read_checkpoint(Path("run/last.ckpt"))["lr_schedulers"]
+    assert (schedule["last_epoch"], schedule["_last_lr"]) == (steps, [0.0])
+
+
+def test_a_run_resumed_by_another_number_of_processes_warns(call, trained, monkeypatch):
+    monkeypatch.setattr("pytorch_lightning.Trainer.fit", lambda *_, **__: None)
+    words = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_epochs=3", "run_dir=run")
+    outcome = call("train", *trained.words, *words, f"ckpt_path={trained.folder / 'last.ckpt'}")
+    warning, *_ = outcome.err.splitlines()
+    assert warning == "warning: the training continues with other values than before of the number of processes"
+
+
+@pytest.mark.parametrize(
+    ("words", "steps"),
+    [
+        (("trainer.max_epochs=-1", "+trainer.max_steps=4"), "4 in epochs of 4, of 2 frames each"),
+        (("trainer.max_epochs=3", "+trainer.check_val_every_n_epoch=2"), "12 in 3 epochs of 4, of 2 frames each"),
+        (("trainer.max_epochs=1", "+trainer.accumulate_grad_batches=3"), "2 in 1 epochs of 2, of 6 frames each"),
+    ],
+)
+def test_the_steps_of_a_run_are_those_of_the_optimizer_and_its_last_validation_has_ssim(call, small, words, steps):
+    outcome = call("train", "+task=undistort", *small, "run_dir=run", *words)
+    assert re.search(rf"^steps +{steps};", outcome.out, re.MULTILINE), outcome.out
+    *_, last = (row["val/ssim"] for row in metrics_rows(Path("run")) if row["val/loss"])
+    assert float(last) > 0
 
 
 def test_a_new_training_does_not_replace_the_checkpoints_of_another_one(call, trained, tmp_path):

@@ -64,7 +64,7 @@ _FOG_VISIBILITIES = [(500.0, 1000.0), (200.0, 500.0), (60.0, 200.0), (40.0, 60.0
 # Real fog by day has a mean of 0.17 to 0.2 of white in the pictures of dashcams.
 _FOG_EXPOSURE: dict[str, Any] = {"target_range": (0.16, 0.24), "gamma_range": (0.7, 1.0), "max_gain": 1.0}
 _NEAR_LAMP, _FAR_LAMP = 20.0, 40.0  # m, away from the camera; 3 d / V is their optical depth
-_LAMP_LUMINANCE = 20.0  # times white
+_LAMP_LUMINANCE = 100.0  # times white; lamps have thousands, over which a lens spreads their light
 _LOW_SUN = (1.0, 0.94, 0.82)
 _TELEPHOTO_FOCAL = 4.0  # widths
 _T = TypeVar("_T")
@@ -132,6 +132,7 @@ def night_fog(
     of_glow: dict[str, Any] = {
         "optical_depth_range": (3 * _NEAR_LAMP / high, 3 * _FAR_LAMP / low),
         "luminance_range": (0.2 * _LAMP_LUMINANCE, 0.6 * _LAMP_LUMINANCE),
+        "threshold": 0.88,  # above most white paint in the light of headlamps
         "camera": _camera(camera),
     }
     fog = _morning_fog(visibility, camera, horizon, depth, lamps | arguments)

@@ -63,6 +63,9 @@ def run_main(monkeypatch, capsys):
     return run_function
 
 
+CLOSED = "[gloo/transport/tcp/pair.cc:561] Connection closed by peer [127.0.0.1]:7."
+
+
 @pytest.mark.quick
 def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_main, capsys):
     def fail(error: Exception) -> None:
@@ -79,6 +82,7 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
             RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed. "),
             "data.workers must fit the memory, got one that ended (DataLoader worker (pid 7) is killed by signal: Kill",
         ),
+        (RuntimeError(CLOSED), "another process of the training has ended: it printed why, or was killed, as for"),
     ):
         with pytest.raises(SystemExit) as stop:
             run_main(lambda error=error: fail(error))
@@ -86,6 +90,22 @@ def test_an_error_of_the_user_is_one_line_and_another_keeps_its_traceback(run_ma
         assert capsys.readouterr().err.startswith(f"error: {message}")
     with pytest.raises(TypeError, match="not callable"):
         run_main(lambda: fail(TypeError("'int' object is not callable")))
+
+
+@pytest.mark.quick
+def test_only_the_first_process_of_a_training_says_that_another_has_ended_or_that_it_was_interrupted(
+    run_main, capsys, monkeypatch
+):
+    for error, code in ((RuntimeError(CLOSED), 1), (KeyboardInterrupt(), 130)):
+        for rank in range(2):
+
+            def fail(error: BaseException = error) -> None:
+                raise error
+
+            monkeypatch.setenv("LOCAL_RANK", str(rank))
+            with pytest.raises(SystemExit) as stop:
+                run_main(fail)
+            assert (stop.value.code, len(capsys.readouterr().err.splitlines())) == (code, 1 - rank)
 
 
 @pytest.mark.quick
@@ -311,7 +331,7 @@ def test_a_run_that_fails_leaves_no_empty_folder_but_those_that_existed(call, tm
         assert call("train", "+task=undistort", *frames, *words).code == 1
     several = call("train", "-m", "+task=undistort", *frames, "seed=1,2")
     assert several.code == 1
-    assert "root must be a folder of frames" in several.message
+    assert several.err.count("root must be a folder of frames") == len(several.err.splitlines()) == 2
     assert call("calibrate", "images=none", "out=a/camera").code == 1
     assert call("rectify", "input=none", "camera=none", "out=a/rectified").code == 1
     assert call("generate", "scene=paper_weather", "source=none", "out=a/pairs", "license=CC0").code == 1
@@ -371,6 +391,12 @@ def test_a_multirun_has_a_folder_for_each_job(call, small, tmp_path):
     assert (outcome := call("train", *words)).code == 0, outcome.err
     for job, seed in enumerate((3, 4)):
         assert OmegaConf.select(OmegaConf.load(tmp_path / f"sweep/{job}/config.yaml"), "data.seed") == seed
+
+
+def test_a_job_of_a_multirun_that_fails_does_not_stop_the_others(call, small, tmp_path):
+    words = ("-m", "+task=undistort", *small, "trainer.max_epochs=0", "model.lr=-1,0.1", "hydra.sweep.dir=sweep")
+    assert call("train", *words).message == "model: lr must be a number of at least 0, got -1"
+    assert [path.name for path in tmp_path.glob("sweep/*/config.yaml")] == ["config.yaml"]
 
 
 # --- frames

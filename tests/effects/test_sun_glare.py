@@ -120,6 +120,20 @@ def test_only_a_sun_in_the_frame_has_ghosts():
         assert torch.equal(with_ghosts, without) != has_ghosts
 
 
+@pytest.mark.parametrize("step", [(1 / 640, 0.0), (0.0, -1 / 360)])
+def test_ghosts_fade_while_the_sun_drifts_out_of_the_frame(step):
+    still: dict[str, Any] = {"ghost_share_range": (1e-3, 1e-3), "gamma_range": (0, 0)}
+    x, y = (1.0, 0.3) if step[0] else (0.6, 0.0)
+    still |= {"center_x_range": (x - 8 * step[0],) * 2, "center_y_range": (y - 8 * step[1],) * 2}
+    still |= {"drift_x_range": step[:1] * 2, "drift_y_range": step[1:] * 2}
+    clip = torch.zeros(1, 17, 3, 360, 640)
+    with_ghosts, without = (SunGlare(**still, num_ghosts=count).degrade(clip, seed=1).intensity for count in (1, 0))
+    peak = (with_ghosts - without).amax(dim=(0, 2, 3, 4))
+    assert (peak[1:] <= 1.001 * peak[:-1]).all()
+    assert (peak[:-1] - peak[1:]).max() < 0.25 * peak[0]
+    assert peak[-1] == 0 < peak[0]
+
+
 def histogram_distance(first: Tensor, second: Tensor) -> float:
     """Return the mean shift of luminance, in levels, that turns one histogram into the other."""
     quantiles = torch.linspace(0, 1, 256)

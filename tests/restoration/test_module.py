@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from torchrefract import Frame, LensDistortion, Pair, UniformFog, presets
 from torchrefract._validation import UsageError
-from torchrefract.data.module import make_pair
+from torchrefract.data.module import make_pair, road_scenes
 from torchrefract.restoration.checkpoints import read_checkpoint
 from torchrefract.restoration.metrics import endpoint_error, psnr, restore_by_transmission
 from torchrefract.restoration.models.coordconv import ResUNet
@@ -387,3 +387,16 @@ def test_mixed_precision_trains_with_finite_float32_weights(trainer, make_batche
     assert {*dtypes} == {torch.bfloat16}
     assert all(value.isfinite() for value in run.callback_metrics.values())
     assert all(value.isfinite().all() and value.dtype == torch.float32 for value in model.parameters())
+
+
+def test_two_processes_with_unequal_numbers_of_frames_have_the_scores_of_one(trainer, monkeypatch):
+    """Lightning rounds the mean number of frames of a process down, if it is an integer."""
+    monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
+    data = road_scenes(effect=LensDistortion(), size=SIZE, train_count=4, val_count=5, batch_size=2, workers=0)
+    model = Restoration(Constant, Undistort())
+    one, two = (
+        trainer(devices=devices, strategy=strategy).validate(model, data, verbose=False)[0]
+        for devices, strategy in ((1, "auto"), (2, "ddp_fork"))
+    )
+    assert one["val/psnr"] > 0
+    assert two == pytest.approx(one, rel=1e-4)

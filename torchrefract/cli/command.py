@@ -23,7 +23,7 @@ from yaml import YAMLError
 
 from torchrefract._io import CONFIG_DIR, config_names
 from torchrefract._validation import UsageError
-from torchrefract.cli.entry import missing_library
+from torchrefract.cli.entry import is_first_process, missing_library
 from torchrefract.cli.options import FILE_ERRORS
 
 _WRITING_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
@@ -55,6 +55,7 @@ _REMOTE_OPTIONS = {
     "train": ("run_dir",),
     "eval": ("run_dir",),
 }
+_LOST_PROCESS = re.compile("(closed|reset) by peer|remote process")  # of gloo and NCCL
 _UNKNOWN_OPTION = re.compile(r"Could not override '(\w+)'")
 _NO_NAME = re.compile(r"\+?(\w+)=(null|true|false|[-+]?(?:inf|nan|[\d._e+-]+))", re.IGNORECASE)  # read as no text
 # Warnings of libraries about settings that are intended.
@@ -78,11 +79,17 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
         name: of the module, and of its file in conf.
         function: called with the configuration.
     """
+    is_multirun, failed = any(argument in _MULTIRUN for argument in sys.argv), list[SystemExit]()
 
     def job(cfg: DictConfig) -> None:
-        with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
-            function(cfg)
-            sys.stdout.flush()
+        try:
+            with _one_line_errors(name), _no_empty_folder(cfg, existing):  # Hydra would add lines to an error
+                function(cfg)
+                sys.stdout.flush()
+        except SystemExit as stop:
+            if not is_multirun or stop.code != 1 or isinstance(stop.__context__, BrokenPipeError):
+                raise
+            failed.append(stop)  # as Hydra does, go on with the other runs
 
     job.__module__ = f"torchrefract.{name}"  # Hydra names the job by it
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
@@ -96,6 +103,8 @@ def run(name: str, function: Callable[[DictConfig], None]) -> None:
         _check_addresses(name, sys.argv[1:])
         sys.argv[1:] = prepare_arguments(name, sys.argv[1:])
         hydra.main(config_path=str(_config_file(name).parent), config_name=name, version_base="1.3")(job)()
+    if failed:
+        raise failed[0]
 
 
 def _check_addresses(name: str, arguments: list[str]) -> None:
@@ -262,10 +271,12 @@ def _one_line_errors(name: str) -> Iterator[None]:
         is_missing = isinstance(error, ModuleNotFoundError)
         if (message := missing_library(error, name) if is_missing else _user_message(error, name)) is None:
             raise
-        print(f"error: {message}", file=sys.stderr)
+        if message:
+            print(f"error: {message}", file=sys.stderr)
         raise SystemExit(1) from error
     except KeyboardInterrupt as error:
-        print(f"stopped; {error if str(error) else 'the same command continues'}", file=sys.stderr)
+        if is_first_process():  # a terminal interrupts all of them
+            print(f"stopped; {error if str(error) else 'the same command continues'}", file=sys.stderr)
         raise SystemExit(128 + signal.SIGINT) from None
 
 
@@ -305,11 +316,17 @@ def _user_message(error: Exception, name: str) -> str | None:
     if isinstance(error, UsageError | HydraException | OmegaConfBaseException | YAMLError):
         unknown = _UNKNOWN_OPTION.match(str(error))
         return _unknown_option(name, unknown[1]) if unknown else " ".join(str(error).split()) + _similar_key(error)
-    return _file_message(error) if isinstance(error, OSError) else _worker_message(error)
+    return _file_message(error) if isinstance(error, OSError) else _process_message(error)
 
 
-def _worker_message(error: Exception) -> str | None:
-    """Return one line for the error that PyTorch raises if a worker of a DataLoader was killed, None for any other."""
+def _process_message(error: Exception) -> str | None:
+    """Return one line for the error that PyTorch raises if another process has ended, None for any other.
+
+    Of the processes of a training, only the first says that another one has ended; the line of others is empty.
+    """
+    if isinstance(error, RuntimeError) and _LOST_PROCESS.search(str(error)):
+        text = "another process of the training has ended: it printed why, or was killed, as for lack of memory; a "
+        return f"{text}training continues by ckpt_path=" if is_first_process() else ""
     reason = str(error).strip().rstrip(".")
     if not reason.startswith("DataLoader worker (pid"):
         return None

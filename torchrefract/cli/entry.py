@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import os
 import signal
 import sys
 import textwrap
@@ -51,6 +52,11 @@ def command(name: str, page: str | None, function: str, *, has_sweeps: bool = Tr
         run(name, job)
 
     return main
+
+
+def is_first_process() -> bool:
+    """Return True in the first of the processes that Lightning or torchrun starts on a machine, and without those."""
+    return os.environ.get("LOCAL_RANK", "0") == "0"
 
 
 def missing_library(error: ModuleNotFoundError, name: str) -> str | None:

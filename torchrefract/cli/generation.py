@@ -170,10 +170,8 @@ def _parse(cfg: DictConfig, out: Path) -> Options:
     size = read_optional(cfg, "size", check_size)
     camera = place_scene(cfg, size=size)
     effect = make_effect(cfg, "scene")
-    if check_seed(cfg.seed) >= _SEED_END:
-        raise UsageError(f"seed must be below {_SEED_END}, got {cfg.seed}")
     plain: dict[str, Any] = {
-        "seed": cfg.seed,
+        "seed": check_seed(cfg.seed, end=_SEED_END),
         "maps": read_option(cfg, "maps", check_choice, choices=FORMATS),
         "drive_by": read_option(cfg, "drive_by", check_choice, choices=("auto", "folder", "prefix")),
         "size": size,

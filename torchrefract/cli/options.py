@@ -92,10 +92,10 @@ def read_path(cfg: DictConfig, name: str) -> Path:
         return as_path(str(cfg[name]))
 
 
-def check_seed(seed: Any) -> int:
-    """Return `seed` if NumPy and PyTorch accept it."""
-    if not isinstance(seed, int) or not 0 <= seed < _NUM_SEEDS:
-        raise UsageError(f"seed must be a whole number from 0 to {_NUM_SEEDS - 1}, got {seed}")
+def check_seed(seed: Any, *, end: int = _NUM_SEEDS) -> int:
+    """Return `seed` if it is a whole number from 0 and below `end`, so that NumPy and PyTorch accept it."""
+    if not isinstance(seed, int) or not 0 <= seed < end:
+        raise UsageError(f"seed must be a whole number from 0 to {end - 1}, got {seed}")
     return seed
 
 

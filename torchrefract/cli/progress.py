@@ -36,7 +36,8 @@ def warn_of_assumed_depth(effect: nn.Module, *, option: str = "depth") -> None:
             warnings.filterwarnings("ignore", "depth is that of a road")  # the line below says it once
             print_warning(
                 f"{type(part).__name__} assumes the depth of a road between walls; depth maps, as estimate_depth "
-                f"writes them, are better: {option}=..."
+                f"writes them, are better: {option}=...; a camera that looks down needs horizon=..., taken as "
+                f"{source.horizon:g}"
             )
             return
 

@@ -2,8 +2,8 @@
 
 import math
 import os
-import signal
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning import Trainer, seed_everything
-from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
 from torchrefract._io import (
@@ -30,6 +30,7 @@ from torchrefract._io import (
 )
 from torchrefract._validation import UsageError, check_choice, check_count, check_flag, check_size
 from torchrefract.cameras.camera import Camera
+from torchrefract.cli.entry import is_first_process
 from torchrefract.cli.estimation import estimate_camera, flow_predictor
 from torchrefract.cli.evaluation import changed_values, describe_validation, use_validation_config
 from torchrefract.cli.options import (
@@ -67,15 +68,15 @@ from torchrefract.data.module import PairData, fingerprint, start_method
 from torchrefract.data.pairs.manifest import locked
 from torchrefract.data.road_scenes import RoadScenes
 from torchrefract.data.video import convert_video, video_info
-from torchrefract.data.workers import num_cores
+from torchrefract.data.workers import exit_with_parent, num_cores
 from torchrefract.restoration.checkpoints import (
     check_fits,
     check_resumed,
     check_run_folder,
-    how_to_continue,
     load_model,
     load_weights,
     read_checkpoint,
+    stopping,
 )
 from torchrefract.restoration.export import FORMATS, export_model
 from torchrefract.restoration.inference import LensRestorer, Restorer
@@ -86,6 +87,7 @@ from torchrefract.restoration.pretrained import WEIGHTS_SUFFIX, find_checkpoint,
 from torchrefract.restoration.tasks import Restored, Undistort
 from torchrefract.warping.warp import INTERPOLATIONS
 
+_FIRST_PROCESS = "TORCHREFRACT_FIRST_PROCESS"
 _MANY_PIXELS = 1 << 22  # of road scenes, whose rendering takes longer than the start of processes
 
 
@@ -102,18 +104,24 @@ def train(cfg: DictConfig) -> None:
             f"trainer.max_epochs must be above the {num_epochs} epochs of ckpt_path, got {limit}; eval scores a "
             "training that is complete"
         )
-    if checkpoint and (changed := changed_values(cfg, checkpoint, ignored=("workers", "pretrained"))):
+    changed = changed_values(cfg, checkpoint, ignored=("workers", "pretrained")) if checkpoint else []
+    if checkpoint and checkpoint.get("processes", trainer.world_size) != trainer.world_size:
+        changed.append("the number of processes")
+    if changed and trainer.is_global_zero:
         print_warning(f"the training continues with other values than before of {', '.join(changed)}")
     initial = None if cfg.init_from is None else find_checkpoint(str(cfg.init_from))
     licenses = initial and load_weights(model, initial, task=model.task.name, config=cfg.model)
-    model.origin = _origin(cfg, data, initial_licenses=licenses)
+    model.origin = _origin(cfg, data, initial_licenses=licenses) | {"processes": trainer.world_size}
     _save_config(cfg, trainer)
     run = as_path(cfg.run_dir)
     with locked("run_dir", run) if trainer.is_global_zero else nullcontext():
         if trainer.is_global_zero:
             _remove_incomplete({run} if cfg.ckpt_path is None else {run, as_path(cfg.ckpt_path).parent}, run)
         _render_scenes(data)
-        _fit(cfg, data, model, trainer)
+        with stopping(trainer, as_path(cfg.run_dir) / "last.ckpt"):
+            trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    if trainer.global_step == 0 and trainer.max_epochs != 0:  # 0 writes the configuration alone
+        raise UsageError("trainer must make a step, got none; raise its max_steps, max_time or limit_train_batches")
 
 
 def _render_scenes(data: PairData) -> None:
@@ -134,22 +142,6 @@ def _remove_incomplete(folders: Iterable[Path], locked_folder: Path) -> None:
                 remove_file(path)
 
 
-def _fit(cfg: DictConfig, data: PairData, model: RestorationModule, trainer: Trainer) -> None:
-    try:
-        trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
-    except SIGTERMException:
-        # Lightning kills its first process, which may still write, once another one has ended with an error.
-        raise SystemExit(128 + signal.SIGTERM if trainer.is_global_zero else 0) from None
-    except MisconfigurationException as error:
-        raise UsageError(f"trainer: {error}") from error
-    except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
-        if isinstance(error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt(how_to_continue(as_path(cfg.run_dir) / "last.ckpt")) from None
-        raise
-    if trainer.global_step == 0 and trainer.max_epochs != 0:  # 0 writes the configuration alone
-        raise UsageError("trainer must make a step, got none; raise its max_steps, max_time or limit_train_batches")
-
-
 def evaluate(cfg: DictConfig) -> None:
     """Score a checkpoint, by default on the data that it was validated on."""
     path = find_checkpoint(str(cfg.ckpt_path))
@@ -159,7 +151,8 @@ def evaluate(cfg: DictConfig) -> None:
     _save_config(cfg, trainer)
     if trainer.is_global_zero:
         print(f"scoring {path} on {describe_validation(data, cfg, changed)}", flush=True)
-    trainer.validate(model, data, ckpt_path=str(path), verbose=False, weights_only=True)
+    with stopping(trainer):
+        trainer.validate(model, data, ckpt_path=str(path), verbose=False, weights_only=True)
 
 
 def restore(cfg: DictConfig) -> None:
@@ -227,7 +220,10 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
     seed_everything(check_seed(cfg.seed), workers=True, verbose=False)
     path = None if cfg.ckpt_path is None else find_checkpoint(cfg.ckpt_path)
     checkpoint = path and read_checkpoint(path, task=str(HydraConfig.get().runtime.choices["task"]))
-    data, model = make(cfg, "data"), make(cfg, "model")
+    with warnings.catch_warnings():
+        if not is_first_process():
+            warnings.simplefilter("ignore", UserWarning)  # those of the first process, which reads the same files
+        data, model = make(cfg, "data"), make(cfg, "model")
     if camera is not None:
         _check_camera(camera, data)
     try:
@@ -237,6 +233,10 @@ def _make_parts(cfg: DictConfig) -> tuple[PairData, RestorationModule, Trainer, 
         if isinstance(error, MisconfigurationException) or name == "csv":
             raise UsageError(f"trainer: {error}") from error
         raise UsageError(f"logger={name} needs its package: pip install 'torchrefract[loggers]'") from error
+    if is_first_process():
+        os.environ[_FIRST_PROCESS] = str(os.getpid())  # for those that Lightning starts on this machine
+    elif first := os.environ.get(_FIRST_PROCESS):
+        exit_with_parent(int(first))
     # Lightning starts the processes of other runs itself.
     processes = int(os.environ.get("WORLD_SIZE") or trainer.world_size)
     if processes != trainer.world_size:
@@ -276,7 +276,7 @@ def _check_camera(camera: Camera, data: PairData) -> None:
         for frame in first:
             height, width = image_size(frame)
             check_frame_of_camera(camera, str(frame), height=height, width=width)
-        if turned := describe_turned(first, upright=True):
+        if (turned := describe_turned(first, upright=True)) and is_first_process():
             print_warning(turned)
 
 

@@ -98,6 +98,17 @@ def _end_daemons() -> None:
         process.kill()
 
 
+def exit_with_parent(parent: int) -> None:
+    """Exit this process when its parent, the first one of a training, is killed; it would wait for half an hour."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def num_cores() -> int:
     """Return the number of cores for this process; processes that torchrun started on one machine share them."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

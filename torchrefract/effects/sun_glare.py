@@ -39,7 +39,7 @@ from torchrefract.fields.exposure import (
 )
 from torchrefract.fields.sky import find_sky, sky_point
 from torchrefract.fields.srgb import color_of_images, linear_to_srgb, srgb_to_linear
-from torchrefract.fields.sun import Sun, sun_light
+from torchrefract.fields.sun import SUN_RADIUS, Sun, sun_light
 from torchrefract.types import Range
 from torchrefract.warping.grid import field_dtype
 
@@ -90,10 +90,10 @@ class SunGlare(PhotometricEffect):
     G = (mean of the clean frame / mean with the sun)^gamma, see `Exposure`. `intensity` is the mean of v over the
     channels; `valid` are the pixels that do not saturate.
 
-    By default the sun stands at a random point of the sky that the frame shows, see `sky_mask`. In a share
-    `outside` of the frames, and in those without sky, it stands above the frame, from where it sends glare but no disk
-    and no ghosts. At night there is none: the drawn luminance is 0. For a clip, its first frame counts; so to degrade
-    a clip in parts, pass the params of the first part to `apply`.
+    By default the sun stands at a random point of the sky that the frame shows, see `sky_mask`. In a share `outside` of
+    the frames, and in those without sky, it stands above the frame, from where it sends glare but no disk and no
+    ghosts; they fade while the disk leaves the frame. At night there is none: the drawn luminance is 0. For a clip, its
+    first frame counts; so to degrade a clip in parts, pass the params of the first part to `apply`.
 
     Args:
         center_x_range, center_y_range: of the sun, in widths and heights from the upper left corner of the frame; both
@@ -240,11 +240,12 @@ class SunGlare(PhotometricEffect):
         image = image.contiguous()  # the rounding of a sum of products depends on the memory format
         height, width = image.shape[2:]
         (focal, _), point = pinhole_of(self.camera, height=height, width=width)
-        sun = self._sun(params, image)
+        px_per_degree = math.radians(focal)
+        sun = self._sun(params, image, px_per_degree)
         x, y = (torch.arange(size, dtype=sun.center.dtype, device=image.device) for size in (width, height))
 
         def light_of(sun: Sun, x: Tensor, y: Tensor) -> Callable[[slice], Tensor]:
-            return sun_light(sun, x, y, principal_point=point, px_per_degree=math.radians(focal))
+            return sun_light(sun, x, y, principal_point=point, px_per_degree=px_per_degree)
 
         clean, stride = metered_nodes(image)
         with_sun = metered_mean(clean + light_of(sun, x[::stride], y[::stride])(slice(None)))
@@ -263,28 +264,29 @@ class SunGlare(PhotometricEffect):
             intensity=lambda: light_of(sun, x, y)(slice(None)).mean(dim=1, keepdim=True),
         )
 
-    def _sun(self, params: SunGlareParams, image: Tensor) -> Sun:
+    def _sun(self, params: SunGlareParams, image: Tensor, px_per_degree: float) -> Sun:
         """Return the sun of each frame; invalid values, which cannot be read on an accelerator, give no light."""
         rows, _, height, width = image.shape
         dtype = field_dtype(image.dtype)
         place = params.center[:, None] + params.frame[:, :, None] * params.drift[:, None]
         place = finite_or(place.to(dtype), -_FARTHEST).clamp(-_FARTHEST, _FARTHEST).reshape(-1, 2)
-        center = place * as_device_tensor((width, height), dtype=dtype, device=place.device) - 0.5
-        is_inside = ((place >= 0) & (place <= 1)).all(dim=1).to(dtype)
+        size = as_device_tensor((width, height), dtype=dtype, device=place.device)
+        inset = (torch.minimum(place, 1 - place) * size).amin(dim=1) / px_per_degree
+        seen = (0.5 + inset / (2 * SUN_RADIUS)).clamp(0, 1)[:, None, None]  # share of the disk in the frame
 
         def expanded(value: Tensor, low: float, high: float) -> Tensor:
             return expand_batch(bounded(value.to(dtype), low, high), rows)
 
         ghosts = [expanded(params.ghosts[..., i], *span) for i, span in enumerate(_GHOST_LIMITS.values())]
         return Sun(
-            center,
+            place * size - 0.5,
             expanded(params.luminance, 0.0, _BRIGHTEST),
             expanded(params.scatter, 0.0, 1.0),
             expanded(params.scale, *_SCALES),
             expanded(params.shape, *_SHAPES),
             expanded(params.color, 0.0, _BRIGHTEST),
             torch.stack(ghosts, dim=-1),
-            expanded(params.tints, 0.0, _BRIGHTEST) * is_inside[:, None, None],  # only a sun in the frame has ghosts
+            expanded(params.tints, 0.0, _BRIGHTEST) * seen,
         )
 
 

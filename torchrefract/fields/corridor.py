@@ -14,6 +14,8 @@ from torchrefract.fields.sky import find_sky, sky_mask
 from torchrefract.warping.grid import field_dtype
 
 _OPEN = 0.1  # share of sky from which a frame counts as open
+_DUSK = (0.03, 0.07)  # `Sky.darkness` around that of the night: `end` changes slowly in a clip
+_TALL = 2.5  # heights, of a tree or a mast that hangs over the sky
 _POLE = 0.03  # widths: narrower things in front of the sky hide no skyline; it is smoothed alike
 
 
@@ -21,17 +23,18 @@ _POLE = 0.03  # widths: narrower things in front of the sky hide no skyline; it 
 class CorridorDepth:
     """The depth of a flat road between two walls along it, and of the sky that is found in the image.
 
-        z = min(z_road(y), max(z_wall(x, y), z_skyline(x))),  inf in the sky
+        z = min(z_road(y), max(z_wall(x, y), z_skyline(x, y))),  inf in the sky
         z_wall = ((r / (f w))^2 + end^-2)^(-1/2),  r = hypot(x - x_v, max(y_h - y, 0))
-        z_skyline = min(f (h - camera_height) / (y_h - y_s(x)), far)
+        z_skyline = min(f (h - camera_height) / (y_h - y_s(x)), f (2.5 h - camera_height) / max(y_h - y, 0), far)
 
     The walls stand for houses, trees and slopes beside the road, which a flat road alone puts at the horizon; above the
     horizon they close in to a tunnel, since what stands far away is not seen high above it. Where the sky is seen down
-    to y_s(x), what stands below it ends there: if it is h high, it is z_skyline away. So open land has no walls.
-    A column without sky has no z_skyline, and by day a frame without sky looks at something near, such as trees or the
-    road itself: `end` is `far`, or min(`far`, `closed`) there; 1 / end is linear between the two in frames of which the
-    sky takes less than a tenth. y_s is the lowest row of the sky around a column. Pass it as `depth=` to a fog; a depth
-    map, or a network (`torchrefract.depth.from_transformers`), is better.
+    to y_s(x), what stands below it ends there: if it is h high, it is z_skyline away. So open land has no walls. Trees
+    and masts that hang over that sky are 2.5 h high at most, so that their tops are near. A column without sky has no
+    z_skyline, and by day a frame without sky looks at something near, such as trees or the road itself: `end` is `far`,
+    or min(`far`, `closed`) there; 1 / end is linear between the two in frames of which the sky takes less than a tenth,
+    or a dark sky 3 to 7 %. y_s is the lowest row of the sky around a column. Pass it as `depth=` to a fog; a depth map,
+    or a network (`torchrefract.depth.from_transformers`), is better.
 
     Numbers out of range raise ValueError.
 
@@ -91,7 +94,7 @@ class CorridorDepth:
         if not torch.compiler.is_compiling():
             warn(
                 "depth is that of a road between walls; pass depth=, a map in m or torchrefract.depth."
-                "from_transformers(...), for fog that knows what stands where"
+                "from_transformers(...), for fog that knows what stands where, or horizon= if the camera looks down"
             )
         height, width = image.shape[2:]
         dtype, device = field_dtype(image.dtype), image.device
@@ -100,7 +103,8 @@ class CorridorDepth:
         r2 = (x - (self.vanishing * width - 0.5)).square() + above.square()[:, None]
         mask = sky_mask(image)
         seen = (mask.to(dtype).mean(dim=(1, 2, 3)) / _OPEN).clamp(max=1)
-        seen = torch.where(find_sky(image).is_night, 1, seen).view(-1, 1, 1, 1)
+        night = (find_sky(image).darkness - _DUSK[0]) / (_DUSK[1] - _DUSK[0])
+        seen = torch.maximum(seen, night.clamp(0, 1).to(dtype)).view(-1, 1, 1, 1)
         end = seen / self.far + (1 - seen) / min(self.far, self.closed)
         walls = (r2 / (self.side * self.focal * width) ** 2 + end.square()).rsqrt()
         walls = torch.maximum(walls, self._skyline(mask, y))
@@ -108,12 +112,13 @@ class CorridorDepth:
         return torch.minimum(road, walls).masked_fill(mask, torch.inf)
 
     def _skyline(self, mask: Tensor, y: Tensor) -> Tensor:
-        """Return (N, 1, 1, W), m, the depth of what ends at the lowest sky of its column; 0 in a column without sky."""
+        """Return (N, 1, H, W), m, the depth of what ends at the lowest sky of its column; 0 in a column without sky."""
         height, width = mask.shape[2:]
         lowest = torch.where(mask, y[:, None], -1.0).amax(dim=2, keepdim=True)
         side = int(_POLE * width / 2)
         around = {"kernel_size": (1, 2 * side + 1), "stride": 1, "padding": (0, side)}
         lowest = F.avg_pool2d(F.max_pool2d(lowest, **around), **around, count_include_pad=False)
-        rise = (self.horizon * height - 0.5 - lowest).clamp(min=1e-3)
-        z = ((self.height - self.camera_height) * self.focal * width / rise).clamp(max=self.far)
-        return torch.where(lowest < 0, 0.0, z)
+        above, size = self.horizon * height - 0.5, (self.height - self.camera_height) * self.focal * width
+        tall = (self.height - self.camera_height) / (_TALL * self.height - self.camera_height)
+        rise = torch.where(lowest < 0, torch.inf, (above - lowest).clamp(min=size / self.far))
+        return size / torch.maximum(rise, tall * (above - y[:, None]))

@@ -35,13 +35,20 @@ class Sky(NamedTuple):
 
     nodes: (N, 1, h, w), bool: the node shows the sky.
     stride: px, the side of a block.
-    is_night: (N,), bool: there is no sky, but 5 % of the frame are dark, smooth and connected to the top row. Of the
-        frames that this was made for, these are 89 % of those at night and 2 % of those by day.
+    darkness: (N,), share of the frame that is dark, smooth and connected to the top row; 0 if there is a sky.
     """
 
     nodes: Tensor
     stride: int
-    is_night: Tensor
+    darkness: Tensor
+
+    @property
+    def is_night(self) -> Tensor:
+        """Return (N,), bool: the darkness exceeds 5 %.
+
+        Of the frames that this was made for, these are 89 % of those at night and 2 % of those by day.
+        """
+        return self.darkness > _MIN_NIGHT_SHARE
 
 
 def _keep_latest(function: _F) -> _F:
@@ -126,7 +133,7 @@ def find_sky(image: Tensor) -> Sky:
     is_sky = is_sky & (_share(sky) >= _MIN_SHARE)
     dark = _connected_to_top(is_smooth & (y < _MAX_NIGHT_LUMA))
     is_sky_node = sky & is_sky & ~_is_shaded(nodes, sky) & (shown.amax(dim=1, keepdim=True) > _BLACK)
-    return Sky(is_sky_node, stride, (~is_sky & (_share(dark) > _MIN_NIGHT_SHARE)).view(-1))
+    return Sky(is_sky_node, stride, (~is_sky * _share(dark)).view(-1))
 
 
 def is_day(image: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ import signal
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pytorch_lightning import Callback, LightningModule, Trainer
 from pytorch_lightning.plugins.io import TorchCheckpointIO
-from pytorch_lightning.utilities.exceptions import SIGTERMException
+from pytorch_lightning.trainer.states import TrainerFn
+from pytorch_lightning.utilities.exceptions import MisconfigurationException, SIGTERMException
 from torch import Tensor, nn
 
 from torchrefract._io import as_path, local_file, make_folder, replace_file
@@ -28,6 +30,7 @@ from torchrefract.restoration.tasks import Task
 
 _PACKAGE = "torchrefract."
 _ALLOWED = (nn.Module, Task)  # the classes that a checkpoint may instantiate
+_SAME = "the same command starts again"  # of an evaluation
 # Parts of the names of weights in older checkpoints, and the parts that replaced them.
 _RENAMED = {"whole": "polynomial_head", "place": "coordinate_weight"}
 _MOVED = re.compile(r"(?<=\.models\.)(resunet|segformer)(?=\.)")  # modules of older checkpoints, now in coordconv
@@ -106,12 +109,31 @@ class StopOnSigterm(Callback):
         """Write the checkpoint, and say how to continue."""
         if not isinstance(exception, SIGTERMException):
             return
-        epochs: Any = trainer.fit_loop.epoch_progress.current
-        # At the end of an epoch, the checkpoint exists already.
-        if epochs.processed < epochs.ready:
-            trainer.save_checkpoint(str(self.path))
+        message = f"stopped by SIGTERM; {_SAME}"
+        if trainer.state.fn == TrainerFn.FITTING:
+            epochs: Any = trainer.fit_loop.epoch_progress.current
+            # At the end of an epoch, the checkpoint exists already.
+            if epochs.processed < epochs.ready:
+                trainer.save_checkpoint(str(self.path))
+            message = f"stopped by SIGTERM in step {trainer.global_step}; {how_to_continue(self.path)}"
         if trainer.is_global_zero:
-            print(f"stopped by SIGTERM in step {trainer.global_step}; {how_to_continue(self.path)}", file=sys.stderr)
+            print(message, file=sys.stderr)
+
+
+@contextmanager
+def stopping(trainer: Trainer, last: Path | None = None) -> Iterator[None]:
+    """Raise what a command raises if Lightning stops for a signal or an invalid option; `last` continues a training."""
+    try:
+        yield
+    except SIGTERMException:
+        # Lightning kills its first process, which may still write, once another one has ended with an error.
+        raise SystemExit(128 + signal.SIGTERM if trainer.is_global_zero else 0) from None
+    except MisconfigurationException as error:
+        raise UsageError(f"trainer: {error}") from error
+    except SystemExit as error:  # Lightning turns Ctrl-C into the status 1
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt(how_to_continue(last) if last else _SAME) from None
+        raise
 
 
 def how_to_continue(path: Path) -> str:

@@ -70,6 +70,7 @@ class RestorationModule(LightningModule, ABC):
         # For the constant baseline: the sum of the valid flows and their number, (3, H, W), over all ranks, and those
         # of this rank that are not yet added.
         self.flows, self.new_flows = torch.zeros(0), torch.zeros(0)
+        self.resumed = (0, 0)  # the complete epochs of the checkpoint that a training resumes, and their steps
         self.origin: dict[str, Any] = {}  # config, data and licenses in plain values, which checkpoints hold
 
     @abstractmethod
@@ -131,8 +132,10 @@ class RestorationModule(LightningModule, ABC):
             true_map = None if clear is None else batch.transmission
             methods["_fog"] = Restored(restore_by_transmission(batch), transmission=true_map)
         # SSIM takes longer than all other scores together, so a training computes it in its last epoch alone.
-        is_last = self.trainer.current_epoch + 1 == self.trainer.max_epochs
-        with_ssim = is_last or self.trainer.state.fn != TrainerFn.FITTING
+        trainer = self.trainer
+        next_epoch = trainer.current_epoch + (trainer.check_val_every_n_epoch or 1)
+        is_last = 0 < (trainer.max_epochs or -1) <= next_epoch or trainer.global_step == trainer.max_steps
+        with_ssim = is_last or trainer.should_stop or trainer.state.fn != TrainerFn.FITTING
         for suffix, result in methods.items():
             scores = restoration_scores(self.task, result, batch, metric_size=self.metric_size, with_ssim=with_ssim)
             self._log("val", scores, batch, suffix=suffix)
@@ -163,6 +166,20 @@ class RestorationModule(LightningModule, ABC):
         mean = (self.flows[:2] / self.flows[2:].clamp(min=1))[None]
         return resize_flow(mean, like.shape[2:]).to(like).expand_as(like)
 
+    @property
+    def steps_per_epoch(self) -> int:
+        """Return the steps of the optimizer in an epoch."""
+        return math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches)
+
+    @property
+    def num_steps(self) -> float:
+        """Return the steps of the training, of which those before a resume may be of other batches."""
+        steps = self.trainer.estimated_stepping_batches
+        if math.isinf(self.trainer.num_training_batches) or self.trainer.max_steps != -1:  # it may load no data
+            return steps
+        epochs, made = self.resumed
+        return steps + made - epochs * self.steps_per_epoch
+
     def num_warmup_steps(self, num_steps: int) -> int:
         """Return the steps of the warm-up in a training of `num_steps`: `warmup_steps`, but at most a tenth of all."""
         return min(self.warmup_steps, num_steps // 10)
@@ -175,7 +192,7 @@ class RestorationModule(LightningModule, ABC):
             # Not strict, since an epoch may have no validation.
             scheduler = {"scheduler": plateau, "monitor": "val/loss", "strict": False}
         else:
-            steps = self.trainer.estimated_stepping_batches
+            steps = self.num_steps
             if math.isinf(steps):
                 raise UsageError(
                     f"schedule must be plateau for a training without a last step, got {self.schedule}; or give the "
@@ -215,17 +232,24 @@ class RestorationModule(LightningModule, ABC):
         checkpoint.update(self.origin, task=self.task.name, flows=(self.flows[:2], self.flows[2:]))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the sums of the flows; rename weights of an older version."""
+        """Restore the sums of the flows; rename weights of an older version; note the steps of complete epochs."""
         checkpoint["state_dict"] = rename_weights(checkpoint["state_dict"])
         self.flows = torch.cat(checkpoint["flows"])
+        if "loops" in checkpoint:  # weights alone have none
+            loop = checkpoint["loops"]["fit_loop"]
+            epochs = loop["epoch_progress"]["current"]
+            steps = loop["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"]
+            of_this = steps["current"]["completed"] if epochs["processed"] < epochs["ready"] else 0
+            self.resumed = epochs["processed"], steps["total"]["completed"] - of_this
 
     def _log(self, split: str, scores: dict[str, Tensor], batch: Pair, suffix: str = "") -> None:
         for name, value in scores.items():
             pixels = through_fog(batch) if name == "psnr_seen" else batch.valid
             kept = value[~value.isnan() | pixels.flatten(1).any(dim=1)]  # NaN of an image without pixels to score
             mean = kept.mean() if len(kept) else torch.zeros((), device=value.device)  # of weight 0
-            options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
-            self.log(f"{split}/{name}{suffix}", mean, batch_size=len(kept), **options)
+            # Lightning averages the number over processes in its type, and would round an integer down.
+            options: dict[str, Any] = {"batch_size": float(len(kept)), "on_step": False, "on_epoch": True}
+            self.log(f"{split}/{name}{suffix}", mean, sync_dist=True, **options)
 
 
 class Restoration(RestorationModule):

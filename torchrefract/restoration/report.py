@@ -150,8 +150,9 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
     data, origin = trainer.datamodule, model.origin  # pyright: ignore[reportAttributeAccessIssue]  # set by `fit`
     train, val = origin["data"], fingerprint(data.val)
     share = val["frames"] / (train["frames"] + val["frames"])
-    steps, per_epoch = trainer.estimated_stepping_batches, trainer.num_training_batches
-    batch = data.batch_size * trainer.world_size
+    steps = model.num_steps
+    epochs = f"{num} epochs" if (num := trainer.max_epochs or -1) > 0 else "epochs"
+    batch = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
     lines = {
         "frames": f"{train['frames']} of {train['source']}" + (f" {root}" if (root := train["root"]) else ""),
         "drives": "unknown" if train["drives"] is None else str(train["drives"]),
@@ -159,7 +160,7 @@ def describe_training(trainer: Trainer, model: RestorationModule) -> list[str]:
         "validation": f"{val['frames']} frames, {share:.0%} of all"
         + ("" if val["drives"] is None else f", of {val['drives']} other drives")
         + ("" if (limit := trainer.limit_val_batches) == 1.0 else f", limit_val_batches {limit}"),
-        "steps": f"{steps} in {trainer.max_epochs} epochs of {per_epoch}, of {batch} frames each",
+        "steps": f"{steps} in {epochs} of {model.steps_per_epoch}, of {batch} frames each",
         "scene": describe_scene(data, origin["config"]["data"].get("effect")),
     }
     if isinstance(model.network, LensNet) and not isinstance(data.effect, LensDistortion | None):

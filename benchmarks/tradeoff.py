@@ -14,10 +14,11 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
@@ -66,6 +67,7 @@ MIN_ERROR = 1e-5  # smaller errors are plotted here
 _MIN_SPAN = 4.0  # ratio of the ends of a time axis
 _COLORS = ("#1f77b4", "#d1495b", "#2e8b57", "#8a5fbf", "#c77f1a")
 _BORDER_PX = 12
+_MARKER_PX = 4  # half the width of a marker
 _LABEL_PLACES = [(x, y) for y in (4, -11, 15, -22, 26, -33) for x in (4, -26)]  # points, from the marker
 
 
@@ -309,7 +311,7 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
                 )
                 for row in members
             ]
-        axes.set(xscale="log", yscale="log", title=name, ylim=(MIN_ERROR / 3, 1000))
+        axes.set(xscale="log", yscale="log", title=name, ylim=(MIN_ERROR / 30, 1000))
         axes.margins(x=0.2)
         low, high = axes.get_xlim()
         widening = max(1.0, math.sqrt(_MIN_SPAN * low / high))  # equal times must not look different
@@ -327,10 +329,11 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
 
 
 def separate_labels(figure: Figure, labels: Sequence[Annotation]) -> None:
-    """Move each label to the first of several places where it overlaps none before; hide it if there is none."""
+    """Move each label to the first of several places without a marker or a label; hide it if there is none."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # lays out the panels
-    placed: list[Bbox] = []
+    markers = [cast(Axes, label.axes).transData.transform(label.xy) for label in labels]
+    placed = [Bbox([marker - _MARKER_PX, marker + _MARKER_PX]) for marker in markers]
     for label in labels:
         for place in _LABEL_PLACES:
             label.xyann = place

@@ -103,8 +103,10 @@ def test_views_of_a_still_board_count_once(call, pictures, rendered_small):
         save_picture(pictures / f"z{k}.png", gray.clip(0, 255).astype(np.uint8))
     outcome = call("calibrate", *OPTIONS)
     assert "opencv4 from 6 views in 10 pictures" in outcome.out, outcome.message
+    still = f"shows the board where {rendered_small[0][0]} does"
+    assert f"not used: z0.png ({still}), z1.png ({still}), z2.png ({still}) and 1 more\n" in outcome.out
     assert "warning" not in outcome.err
-    assert f"shows the board where {rendered_small[0][0]} does" in read_report(pictures.parent)
+    assert still in read_report(pictures.parent)
 
 
 @pytest.mark.usefixtures("blank_figures")

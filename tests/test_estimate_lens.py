@@ -72,8 +72,12 @@ def test_a_damaged_video_is_named_and_the_others_are_used(call, folder):
     outcome = call("estimate_lens", "input=raw")
     assert "from 6 frames" in outcome.out
     assert outcome.err.splitlines()[0].startswith("skipped: raw/bad.mp4 is not a video with a frame that")
-    last = call("estimate_lens", "input=raw/bad.mp4").err.splitlines()[-1]
-    assert last.startswith("error: input must hold a readable picture or video, got raw/bad.mp4 is not a video with")
+    assert call("estimate_lens", "input=raw/bad.mp4").message.startswith("raw/bad.mp4 is not a video with a frame")
+    (folder / "bad").mkdir()
+    for name in ("a.mp4", "b.mp4"):
+        (folder / "bad" / name).write_bytes(b"no video")
+    last = call("estimate_lens", "input=bad").err.splitlines()[-1]
+    assert last.startswith("error: input must hold a readable picture or video, got bad/b.mp4 is not a video with")
 
 
 def test_the_flows_of_a_checkpoint_are_used(call, folder, shifted):

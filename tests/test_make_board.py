@@ -41,8 +41,8 @@ def test_a_png_has_its_dots_per_inch(call, tmp_path):
     ],
 )
 def test_every_board_is_detected(call, tmp_path, option, board):
-    assert call("make_board", option, "out=board.png", "dpi=90").code == 0
-    gray = np.asarray(cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE))
+    assert call("make_board", option, "out=new/board.png", "dpi=90").code == 0
+    gray = np.asarray(cv2.imread(str(tmp_path / "new" / "board.png"), cv2.IMREAD_GRAYSCALE))
     assert len(detect(gray, board).ids) == 70
 
 
@@ -50,7 +50,6 @@ def test_every_board_is_detected(call, tmp_path, option, board):
     ("options", "message"),
     [
         (("out=board.svg",), "out must end in .pdf or .png, got board.svg"),
-        (("out=none/board.pdf",), "none/board.pdf could not be written: No such file or directory"),
         (("dpi=1",), "dpi must be a number in [20, 2400], got 1"),
         (("squares=eleven",), "board: squares must be columns x rows, such as 11x8, got 'eleven'"),
         (("board=circles",), "board must be one of charuco, chessboard, got circles"),

@@ -131,6 +131,7 @@ def test_each_video_is_restored_along_one_lens_by_a_model_that_finds_lenses(call
     outcome = call("restore", "ckpt_path=lens_small", "input=raw", "out=out")
     assert outcome.out.splitlines()[0].startswith("out/a.camera.yaml: k1 -0.")
     assert "out: 2 restored, 0 already existed, 1 skipped" in outcome.out
+    assert outcome.err.count("skipped: ") == 1
     assert files_in(tmp_path / "out") == ["a.camera.yaml", "a.mp4", "b.png", "config.json"]
     flow = camera_flow(read_camera(tmp_path / "out" / "a.camera.yaml"))[0]
     assert flow.abs().max() > 3

@@ -36,7 +36,7 @@ def test_the_pareto_front_is_what_no_other_cost_dominates(seed):
 
 
 @pytest.mark.quick
-def test_labels_do_not_overlap():
+def test_labels_overlap_neither_markers_nor_one_another():
     figure = Figure(figsize=(4, 3))
     axes = figure.subplots()
     labels = [
@@ -47,6 +47,8 @@ def test_labels_do_not_overlap():
     boxes = [label.get_window_extent(renderer) for label in labels if label.get_visible()]
     assert len(boxes) == 5
     assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+    markers = axes.transData.transform([label.xy for label in labels])
+    assert not any(box.contains(*marker) for box, marker in itertools.product(boxes, markers))
     crowd = [axes.annotate("bilinear", (0.9, 0.9), (4, 4), textcoords="offset points") for _ in range(20)]
     tradeoff.separate_labels(figure, crowd)
     assert 1 < sum(label.get_visible() for label in crowd) < 20

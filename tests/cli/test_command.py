@@ -356,6 +356,11 @@ def test_an_experiment_chooses_its_task_and_is_shown_without_a_run(call, tmp_pat
         ("+task=sharpen", "task must be one of deweather, undistort, got sharpen"),
         ("model=unet", "model must be one of bridge, ddpm, ddpm_cat256, .* resunet, segformer, got unet$"),
         ("scene=london", "scene must be one of cape_town_fog, cheap_dashcam, highveld_heat_haze, .* got london"),
+        (
+            "scene=my/scenes/fog.yaml",
+            "scene must be one of .*, got my/scenes/fog.yaml; a file DIR/scene/NAME.yaml is given by --config-dir DIR "
+            "scene=NAME$",
+        ),
         ("logger=false", "logger must be one of csv, tensorboard, wandb, got false$"),
         ("data=null", "data must be one of frames, pairs, road_scenes, got null$"),
         ("sede=1", "an option must be one of .*, got sede; did you mean seed"),

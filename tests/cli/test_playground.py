@@ -118,6 +118,14 @@ def test_a_view_shows_both_maps_the_plan_the_time_and_warnings(tmp_path):
     assert "Warning" not in lens.about
 
 
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the test is of the legend
+def test_the_legend_of_the_map_of_an_upright_picture_ends_within_it(tmp_path):
+    source = picture(write_picture(tmp_path / "a.png", 192, 96), max_side=192)
+    drawn = view(source, config_of("cape_town_fog", severity=3, width=96), seed=0, key=0).map
+    assert drawn is not None
+    assert (drawn[:, -8:] == 255).all()
+
+
 @pytest.mark.quick
 def test_what_is_no_picture_is_named_without_its_folder(tmp_path):
     (tmp_path / "text.png").write_text("no picture")
@@ -130,6 +138,19 @@ def test_without_gradio_the_error_names_the_extra():
     error = ModuleNotFoundError("No module named 'gradio'", name="gradio")
     expected = "playground needs gradio, which is not installed: pip install 'torchrefract[playground]'"
     assert missing_library(error, "playground") == expected
+
+
+_SHOW = """from torchrefract.cli.playground import make_page
+show = next(of.fn for of in make_page({}, max_side=96).fns.values() if of.name == "show")
+print(show(None, None, "Vignetting", 3, None, None)[3])
+"""
+
+
+def test_an_empty_number_is_0_so_that_the_copied_code_makes_the_picture(spawn, tmp_path):
+    pytest.importorskip("gradio", reason="gradio is in the extra playground")
+    code = spawn("-c", _SHOW, cwd=tmp_path).out
+    assert "torch.tensor([0])" in code
+    assert "seed=0, keys=[0]" in code
 
 
 def free_port() -> int:
@@ -225,7 +246,7 @@ def test_a_file_that_is_no_picture_and_one_that_is_too_large_are_one_line_on_the
         file.truncate(51 * 1024**2)
     browser.get(page)
     for name, message in (
-        ("text.png", "text.png is not a JPEG, PNG, WebP or BMP image; move a slider back, or choose another picture"),
+        ("text.png", "text.png is not a JPEG, PNG, WebP or BMP image; choose another picture"),
         ("large.png", 'exceed the maximum allowed size of 50.0 Mb: "large.png"'),
     ):
         wait_for(lambda: browser.find_element("css selector", "input[type=file]"), "file input").send_keys(

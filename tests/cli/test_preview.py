@@ -104,8 +104,8 @@ def test_a_picture_becomes_a_contact_sheet(call, picture, tmp_path):
         assert sheet_shows(tmp_path / "preview.png", cell)
     other_seed = row_of(tr.LensDistortion(), read_image(picture)[None], seed=4)
     assert not sheet_shows(tmp_path / "preview.png", other_seed.corrupted)
-    assert call("preview", "frame.png", *LENS, "seed=3", "out=again.png").code == 0
-    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "preview.png").read_bytes()
+    assert call("preview", "frame.png", *LENS, "seed=3", "out=new/again.png").code == 0
+    assert (tmp_path / "new" / "again.png").read_bytes() == (tmp_path / "preview.png").read_bytes()
 
 
 def test_without_a_picture_all_effects_are_drawn_on_a_rendered_scene(call, tmp_path):
@@ -217,8 +217,7 @@ def test_an_unreadable_picture_is_one_line_of_error(call, picture, tmp_path):
         ("size=[64,64]", "size: image must be at least size = 64x64"),
         ("out=sheet.doc", r"out must end in one of \.apng, .*\.gif, .*\.mp4, .*\.png, .*\.webp, got sheet.doc"),
         ("out=sheet", "out must end in one of .*, got sheet"),
-        ("out=none/sheet.png", "none/sheet.png could not be written: No such file or directory"),
-        ("out=frame.png/sheet.png", "frame.png/sheet.png could not be written: Not a directory"),
+        ("out=frame.png/sheet.png", "frame.png/sheet.png could not be written: File exists"),
         ("out=folder.png", "out must be a file, got the folder folder.png"),
         ("frames=0", "frames must be at least 1, got 0"),
         ("frames=2.5", "frames must be a whole number, got 2.5"),

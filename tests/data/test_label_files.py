@@ -44,6 +44,12 @@ def moved(flow: Tensor | None, *annotations: dict[str, Any]) -> tuple[list[dict[
 
 
 @pytest.mark.quick
+def test_a_box_of_which_less_than_a_pixel_remains_is_dropped():
+    assert moved(shift(69.8, 0.0), BOX) == ([], 1)  # 0.2 px
+    assert moved(shift(68.8, 0.0), BOX)[1] == 0
+
+
+@pytest.mark.quick
 def test_boxes_and_polygons_count_from_the_edge_and_keypoints_from_the_center_of_a_pixel():
     keypoints = {"keypoints": [10, 20, 2, 79, 30, 1, 0, 0, 0], "num_keypoints": 2}
     (box,), dropped = moved(shift(5.0, -3.0), BOX | {"segmentation": [SQUARE]} | keypoints)

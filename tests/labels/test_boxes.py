@@ -48,6 +48,13 @@ def test_boxes_follow_a_shift():
 
 
 @pytest.mark.quick
+def test_a_box_of_which_the_frame_leaves_less_than_a_pixel_is_not_kept():
+    flow = torch.tensor([10.0, -5.0]).view(2, 1, 1).expand(2, *SIZE)
+    boxes = torch.tensor([[4.0, 30.0, 9.7, 60.0], [4.0, 30.0, 10.6, 60.0], [20.0, 30.0, 20.2, 60.0]])
+    assert warp_boxes(boxes, flow)[1].tolist() == [False, True, True]  # 0.2, 1.1 and all 0.2 px are left
+
+
+@pytest.mark.quick
 def test_a_box_without_an_area_has_no_inside():
     flow = torch.tensor([10.0, -5.0]).view(2, 1, 1).expand(2, *SIZE)
     boxes = torch.tensor([[20.0, 30.0, 20.0, 30.0], [0, 0, 0, 0], [300, 300, 300, 300], [20, 30, 20, 60]])

@@ -213,9 +213,10 @@ def test_boxes_below_the_limits_are_dropped():
 
 @pytest.mark.parametrize("form", PLAIN_FORMATS)
 def test_a_box_of_integers_that_rounding_leaves_no_area_is_dropped(form):
-    boxes = boxes_of([[2.0, 4.0, 12.0, 10.0], [30.0, 6.0, 50.0, 20.0]])
+    boxes = boxes_of([[6.0, 4.0, 7.0, 10.0], [30.0, 6.0, 50.0, 20.0]])
     boxes = v2.functional.convert_bounding_box_format(boxes, new_format=form)
-    flow = torch.tensor([11.6, 0.0]).view(2, 1, 1).expand(2, *SIZE)  # 0.4 px of the first box stay in the frame
+    x = torch.arange(SIZE[1]).float().expand(SIZE)
+    flow = torch.stack([1.5 * x, torch.zeros(SIZE)])  # the first box becomes 0.4 px wide
     for dtype, labels in ((torch.float32, [7, 8]), (torch.int64, [8])):
         sample = {"boxes": tv.wrap(boxes.as_subclass(Tensor).to(dtype), like=boxes), "labels": torch.tensor([7, 8])}
         assert warp_labels(sample, flow)["labels"].tolist() == labels

@@ -162,7 +162,7 @@ def test_an_invalid_tolerance_raises(kind, value):
 @pytest.mark.quick
 @pytest.mark.parametrize("effect", [LensDistortion(tolerance_px=1e-5), Compose([DivergenceFree()], tolerance_px=1e-5)])
 def test_a_tolerance_below_rounding_raises_and_names_the_smallest_one(effect):
-    rule = r"tolerance_px must be at least 0.00\d+ px for float32 positions in a frame of 1080 x 1920 px .* got 1e-05"
+    rule = r"tolerance_px must be at least 0.00\d+ px for float32 positions in a frame of 1920 x 1080 px .* got 1e-05"
     with pytest.raises(ValueError, match=rule):
         effect.plan(1080, 1920)
     with pytest.raises(ValueError, match=rule):

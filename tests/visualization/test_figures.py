@@ -94,6 +94,12 @@ def test_scores_are_those_of_restorable_pixels(frame):
         assert number(rf"([\d.]+) dB {name}", row.scores) == pytest.approx(expected, abs=0.051)
 
 
+def test_a_frame_that_stays_is_unchanged_and_has_no_score(frame):
+    for effect in (tr.NightGlow(), tr.Turbulence(amplitude_range=(0.0, 0.0))):
+        row = contact_sheet_row("none", effect, frame=0.5 * frame, seed=0)
+        assert row.scores.endswith("100.0% valid; unchanged")
+
+
 @pytest.mark.parametrize("linear_light", [False, True])
 def test_fog_has_a_map_of_its_transmission_and_is_removed_from_8_bits(frame, linear_light):
     fog = tr.UniformFog(visibility_range=(100.0, 100.0), linear_light=linear_light)

@@ -12,8 +12,8 @@ import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import make_writable_folder, replace_file, write_figure, write_file
-from torchrefract._validation import UsageError, check_choice, check_number
+from torchrefract._io import make_folder, make_writable_folder, replace_file, write_figure, write_file
+from torchrefract._validation import UsageError, check_choice, check_number, first_names
 from torchrefract.cameras.calibration.boards import Board, Charuco, board_page
 from torchrefract.cameras.calibration.choice import AUTO
 from torchrefract.cameras.calibration.detection import (
@@ -79,6 +79,7 @@ def make_board(cfg: DictConfig) -> None:
     if out.suffix.lower() not in _BOARD_FORMATS:
         raise UsageError(f"out must end in {' or '.join(_BOARD_FORMATS)}, got {out}")
     try:
+        make_folder(out.parent)
         write_figure(out, board_page(board, margin_mm=margin), dpi=dpi)
     except OSError as error:
         raise UsageError(f"{out} could not be written: {error.strerror}") from error
@@ -266,6 +267,10 @@ def _rendered(board: Board, folder: Path) -> list[Path]:
 def _print_summary(calibration: Calibration, out: Path) -> None:
     for name, reason in calibration.dropped.items():
         print(f"{name} dropped: {reason}")
+    if unused := [
+        f"{detection.view.name} ({detection.problem})" for detection in calibration.detections if detection.problem
+    ]:
+        print(f"not used: {first_names(unused)}")
     if calibration.fit.rms > _HIGH_RMS * calibration.fit.camera.width:
         print_warning(
             f"an error of {calibration.fit.rms:.2f} px rms is high: the board may be bent, or the pictures of several "

@@ -298,8 +298,13 @@ def _one_line_warnings() -> Iterator[None]:
 def _user_message(error: Exception, name: str) -> str | None:
     """Return one line for an error that the user of a command can fix, None for any other."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        group, _, option = error.missing_cfg_file.rpartition("/")
-        return f"{group} must be one of {', '.join(error.options or [])}, got {option}"
+        file = error.missing_cfg_file
+        group, _, option = file.rpartition("/") if file.startswith("hydra/") else file.partition("/")
+        choices = ", ".join(error.options or [])
+        message = f"{group} must be one of {choices}, got {option}"
+        if Path(option).suffix in (".yaml", ".yml"):
+            message += f"; a file DIR/{group}/NAME.yaml is given by --config-dir DIR {group}=NAME"
+        return message
     if str(error).startswith("Config group override must be"):  # a ValueError of Hydra
         for group, value in (word.groups() for word in map(_NO_NAME.fullmatch, sys.argv[1:]) if word):
             if choices := config_names(group):

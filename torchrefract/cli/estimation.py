@@ -231,6 +231,8 @@ def _read_frames(chosen: Sequence[tuple[Path, list[int]]], *, upright: bool) -> 
             if times and num_read == num_before:
                 raise UnreadableImageError(f"{file} is not a video with a frame that can be decoded")
         except UnreadableImageError as error:
+            if len(chosen) == 1 and num_read == 0:
+                raise  # `restore` names each video that it skips
             skipped.add(str(error))
     if num_read == 0:
         raise UnreadableImageError(f"input must hold a readable picture or video, got {skipped.errors[-1]}")

@@ -102,13 +102,15 @@ def make_page(table: Sliders, *, max_side: int) -> gr.Blocks:
         return config_of(choice, severity=severity, width=width)
 
     def show(path: str | None, road: int, choice: str, severity: int, seed: int, key: int, *positions: float) -> Any:
+        road, seed, key = (number or 0 for number in (road, seed, key))  # None for an empty field
         try:
             chosen = config(choice, severity, path)
             if positions:
                 chosen = with_fixed(chosen, sliders_of(chosen, table), positions)
             seen = view(source(path, road), chosen, seed=seed, key=key)
         except (ValueError, TypeError, OSError) as error:
-            message = f"{error}; move a slider back, or choose another picture"
+            remedy = "" if isinstance(error, UnreadableImageError) else "move a slider back, or "
+            message = f"{error}; {remedy}choose another picture"
             raise gr.Error(message, duration=None, print_exception=False) from error
         return (seen.before, seen.after), seen.map, seen.about, seen.code, seen.yaml
 
@@ -126,10 +128,12 @@ def make_page(table: Sliders, *, max_side: int) -> gr.Blocks:
                     with gr.Tab("Python"):
                         code = gr.Code(language="python", label="Python code of the picture", elem_id="code")
                     with gr.Tab("YAML"):
-                        yaml = gr.Code(language="yaml", label="YAML of the effect, as in conf/scene")
+                        yaml = gr.Code(
+                            language="yaml", label="YAML, as DIR/scene/NAME.yaml for --config-dir DIR scene=NAME"
+                        )
             with gr.Column(scale=1, min_width=320, elem_classes="controls"):
-                path = gr.File(label="a JPEG, PNG, WebP or BMP of at most 50 MB, or a rendered road", height=160)
-                road = gr.Number(0, label="number of the rendered road", precision=0, minimum=0)
+                path = gr.File(label="JPEG, PNG, WebP or BMP up to 50 MB", height=160)
+                road = gr.Number(0, label="without a picture, number of the rendered road", precision=0, minimum=0)
                 choice = gr.Dropdown(choices(), value="cape_town_fog", label="scene or effect", elem_id="choice")
                 severity = gr.Slider(1, 5, 3, step=1, label="severity of the scene", elem_id="severity")
                 with gr.Row():

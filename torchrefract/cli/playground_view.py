@@ -31,6 +31,7 @@ from torchrefract.visualization.layout import FigureLayout
 
 RENDERED_SIZE = (540, 960)  # height and width
 _MAP_SIDE = 640  # px
+_LEGEND_LINES = 20  # width of the longest legend of a map, in heights of a line
 _NUM_STEPS = 200  # of a slider, about
 _LOGARITHM = "log10 of "  # begins the unit of a slider that moves by powers of ten
 
@@ -237,9 +238,11 @@ def _draw_one_map(degraded: Degraded, scales: tuple[MapScale, ...]) -> np.ndarra
     image = map_image(degraded, scales, largest=_MAP_SIDE)
     is_flow = scales[0].name == "flow"
     footer = 3 if is_flow else 0
-    layout = FigureLayout(1, 1, *image.shape[1:], caption_lines=2, header_lines=1, footer_lines=footer)
-    layout.show(image, layout.left(0), layout.top(0))
-    draw_legend(layout, scales, x=layout.left(0), y=layout.top(0))
+    layout = FigureLayout(
+        1, 1, *image.shape[1:], caption_lines=2, header_lines=1, footer_lines=footer, min_column_lines=_LEGEND_LINES
+    )
+    layout.show(image, layout.text, layout.top(0))
+    draw_legend(layout, scales, x=layout.text, y=layout.top(0))
     if is_flow:
-        draw_invalid_key(layout, x=layout.left(0), y=layout.top(0) + layout.height + layout.text)
+        draw_invalid_key(layout, x=layout.text, y=layout.top(0) + layout.height + layout.text)
     return layout.render().copy()

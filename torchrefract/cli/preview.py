@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from torch import Tensor
 
-from torchrefract._io import replace_file, write_figure
+from torchrefract._io import make_folder, replace_file, write_figure
 from torchrefract._validation import UsageError, check_count, check_number, check_positive, check_size
 from torchrefract.cli.options import check_seed, make_effect, naming, place_scene, read_option, read_optional
 from torchrefract.cli.progress import print_warning, progress, warn_of_assumed_depth
@@ -187,6 +187,7 @@ def _writing(out: str) -> Iterator[Path]:
     if Path(out).is_dir():
         raise UsageError(f"out must be a file, got the folder {out}")
     try:
+        make_folder(Path(out).parent)
         with replace_file(Path(out)) as path:
             path.touch()
             yield path

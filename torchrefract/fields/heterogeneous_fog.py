@@ -84,6 +84,6 @@ def periods_in_frame(
     if height * width > max_nodes * shortest * shortest:
         raise ValueError(
             f"scales must have periods of at least {(height * width / max_nodes) ** 0.5:.2g} px in a frame of "
-            f"{height} x {width} px, got {shortest:.2g} px"
+            f"{width} x {height} px, got {shortest:.2g} px"
         )
     return periods

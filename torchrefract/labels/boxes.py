@@ -14,6 +14,7 @@ from torchrefract.warping.implicit import sample_linear
 # Probes along each side of the frame: they find the part of a box whose outline the frame does not show.
 _NUM_PROBES = 49
 _SAMPLES = 64  # points on each edge
+_SLIVER_PX = 1.0  # the frame cuts off all but less than this of a side
 _STEP_PX = 1.0  # longest piece of an edge, between whose ends a flow is taken as linear
 
 
@@ -43,7 +44,8 @@ def warp_boxes(
 
     Returns:
         boxes: (B, N, 4) or (N, 4), px, float32 or float64, finite; an invisible box has zero area if clipped.
-        keep: (B, N) or (N,), bool: the box is visible, has an area above 0, and satisfies both limits.
+        keep: (B, N) or (N,), bool: the box is visible, has an area above 0, and satisfies both limits. A box of which
+            the frame cuts off all but less than 1 px of its width or height is not kept.
 
     Raises:
         ValueError: if shapes do not fit, x2 < x1 or y2 < y1 (checked on the CPU), or a limit is out of range.
@@ -78,9 +80,11 @@ class Extent(NamedTuple):
     visible: Tensor  # (B, N), bool: the frame shows a part of the outline or of its inside
 
     def keep(self, min_area: float, min_visibility: float) -> Tensor:
-        """Return True for visible rectangles with an area above 0 that satisfy both limits: (B, N)."""
-        area, full_area = ((high - low).prod(dim=-1) for low, high in (self.clipped, self.unclipped))
-        return self.visible & (area > 0) & (area >= min_area) & (area >= min_visibility * full_area)
+        """Return True for visible rectangles with an area above 0 that satisfy all limits: (B, N)."""
+        sides, full_sides = (high - low for low, high in (self.clipped, self.unclipped))
+        area, full_area = sides.prod(dim=-1), full_sides.prod(dim=-1)
+        is_sliver = (sides < full_sides.clamp(max=_SLIVER_PX)).any(dim=-1)
+        return self.visible & ~is_sliver & (area > 0) & (area >= min_area) & (area >= min_visibility * full_area)
 
 
 class Outlines(NamedTuple):

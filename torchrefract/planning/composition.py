@@ -75,7 +75,7 @@ class ComposePlan:
     def __str__(self) -> str:
         tolerance = "none: exact" if self.tolerance_px is None else f"{self.tolerance_px:g} px"
         lines = [
-            f"frame          {self.height} x {self.width} px",
+            f"frame          {self.width} x {self.height} px",
             f"tolerance      {tolerance}",
             f"error at most  {self.error_px:.2g} px",
             f"samplings      {self.num_samplings}",

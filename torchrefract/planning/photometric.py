@@ -90,7 +90,7 @@ class PhotometricPlan:
 
     def __str__(self) -> str:
         lines = [
-            f"frame          {self.height} x {self.width} px",
+            f"frame          {self.width} x {self.height} px",
             f"tolerance      {'none: exact' if self.tolerance is None else f'{self.tolerance:g} levels of 1/255'}",
             f"light          {self.summary()}",
             f"error at most  {self.error:.2g} levels",

@@ -90,7 +90,7 @@ class PlanRequest:
             dtype = "float64" if self.is_double else "float32"
             raise ValueError(
                 f"tolerance_px must be at least {2 * self.rounding_px:.2g} px for {dtype} positions in a frame of "
-                f"{self.height} x {self.width} px (None is exact), got {self.tolerance_px:g}"
+                f"{self.width} x {self.height} px (None is exact), got {self.tolerance_px:g}"
             )
         return self.tolerance_px - self.rounding_px
 
@@ -146,7 +146,7 @@ class WarpPlan:
 
     def __str__(self) -> str:
         lines = [
-            f"frame          {self.height} x {self.width} px",
+            f"frame          {self.width} x {self.height} px",
             f"tolerance      {'none: exact' if self.tolerance_px is None else f'{self.tolerance_px:g} px'}",
             f"flow           {self.summary()}",
             f"error at most  {self.error_px:.2g} px",

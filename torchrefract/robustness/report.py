@@ -220,6 +220,8 @@ def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
     """Draw the score, with intervals, or one of all images together."""
     figure = Figure(figsize=(5, 4.6), layout="constrained")
     axes = figure.subplots()
+    clean = float(result.clean.mean()) if of == "score" else result.set_scores[None][of]
+    axes.axhline(clean, color="gray", linestyle="--", label="clean")
     for i, scene in enumerate(result.scenes):
         of_scene = [row for row in rows if row.scene == scene]
         shift = _SPACING * (i - (len(result.scenes) - 1) / 2)  # so that equal scores do not hide one another
@@ -229,8 +231,6 @@ def _curves(result: Robustness, rows: Sequence[Row], of: str) -> bytes:
             axes.errorbar(x, y[:, 0], yerr=abs(y[:, 1:] - y[:, :1]).T, marker="o", capsize=3, label=scene)
         else:
             axes.plot(x, [row.set_scores[of] for row in of_scene], marker="o", label=scene)
-    clean = float(result.clean.mean()) if of == "score" else result.set_scores[None][of]
-    axes.axhline(clean, color="gray", linestyle="--", label="clean")
     axes.set(xlabel="severity", ylabel=of, ylim=(0, 1.02), xticks=sorted({level.severity for level in result.scores}))
     figure.legend(*axes.get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=2)
     buffer = io.BytesIO()

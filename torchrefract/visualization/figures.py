@@ -74,6 +74,7 @@ _PARAMETER_TEXTS: dict[str, Callable[[Tensor], str]] = {
 }
 _MAP_UNITS = {"extinction": "/m"}
 _WHITE = 1.0  # the largest light of an intensity that is shown
+_EQUAL_DB = 100.0  # above it, no image file holds the difference
 _NEUTRAL = {"transmission": 1.0, "intensity": 0.0}  # value of a map that changes nothing
 
 
@@ -307,11 +308,12 @@ def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, fo
     valid = degraded.valid if restored is None else restored.valid
     texts = [f"{valid.float().mean().item():.1%} valid"]
     if valid.any():
-        texts.append(f"{_psnr(degraded.image, frame, valid):.1f} dB corrupted")
+        before = _psnr(degraded.image, frame, valid)
+        texts.append("unchanged" if before >= _EQUAL_DB else f"{before:.1f} dB corrupted")
     if degraded.has("flow"):
         longest = (length(degraded.flow) * degraded.valid).max().item()
         texts.insert(0, f"largest displacement {longest:.3g} px")
-    if restored is not None and valid.any():
+    if restored is not None and "corrupted" in texts[-1]:
         texts[-1] += f", {_psnr(restored.image, frame, valid):.1f} dB {restored.label}"
     if folds.any():
         texts.append(f"{100 * folds.float().mean().item():.2g}% folded")
@@ -321,7 +323,7 @@ def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, fo
 def _psnr(image: Tensor, frame: Tensor, valid: Tensor) -> float:
     """Compute the peak signal-to-noise ratio on valid pixels, dB."""
     mse = (image.clamp(0, 1) - frame)[valid.expand_as(frame)].square().mean()
-    return -10 * mse.clamp(min=1e-10).log10().item()
+    return -10 * mse.log10().item()
 
 
 def _draw_row(layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
@@ -341,7 +343,7 @@ def _draw_row(layout: FigureLayout, row: ContactSheetRow, i: int) -> None:
     if row.arrows is None:
         layout.write("no motion", x + layout.width / 2, y + layout.height / 2, ha="center")
         return
-    text = f"motion x {row.arrows.enlargement:g}, up to {row.arrows.longest:.2g} px"
+    text = f"motion x {row.arrows.enlargement:g}, up to {row.arrows.longest:.3g} px"
     layout.write(text, x + layout.width / 2, y - 0.4 * layout.text, ha="center")
     layout.show(0.3 * row.corrupted + 0.7, x, y)
     height, width = row.corrupted.shape[1:]

@@ -47,6 +47,7 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
         ("size=[0,4]", "size must be at least 1, got 0"),
         ("size=[400,400]", "source: frames must be at least size = 400x400"),
         ("source=nowhere", "source must be a folder of images or videos, or a video, got nowhere, which does not"),
+        ("source=empty", "source must hold .jpg, .jpeg, .png, .webp, .bmp, .mp4, .avi"),
         ("shards=2", "shard must be given together with shards, got None of 2"),
         ("shard=2 shards=2", "shard must be below shards = 2, got 2"),
         ("tar=0", "tar must be at least 1, got 0"),
@@ -58,6 +59,7 @@ def disk(tmp_path) -> Iterator[Callable[[str], Path]]:
     ],
 )
 def test_an_invalid_option_raises_before_anything_is_written(call, words, tmp_path, word, message):
+    (tmp_path / "empty").mkdir()
     kept = [option for option in words("out") if option.partition("=")[0] != word.partition("=")[0]]
     assert message in call("generate", *kept, *(word.split(" ") if word.startswith("shard") else [word])).message
     assert not (tmp_path / "out").exists()

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 from array import array
 from pathlib import Path
 
@@ -165,6 +166,7 @@ def test_the_card_has_counts_and_the_license(refractive, rows):
     card, listed = (refractive / "README.md").read_text(), rows(refractive)
     assert f"# {COUNT} pairs of the scene paper_refractive" in card
     assert "CC0" in card
+    assert re.search(r"between them: \d+\.\d (kB|MB), from", card)
     for split in ("train", "val"):
         part = [row for row in listed if row["split"] == split]
         assert f"| {split} | {len(part)} | {len({row['drive'] for row in part})} |" in card

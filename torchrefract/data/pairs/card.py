@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from rich.filesize import decimal
 
 from torchrefract._io import replace_file, write_file
 from torchrefract.cameras.brown_conrady import POLYNOMIAL12
@@ -124,7 +125,7 @@ def format_card(summary: Summary, *, settings: Mapping[str, Any], license_text: 
         f"# {count} pairs of the scene {scene}",
         "",
         f"Clean frames, the same frames degraded by `{settings['scene']['_target_']}` of torchrefract, and the maps "
-        f"between them: {summary.num_bytes / 1e9:.3g} GB, from {summary.num_sources} frames, {sizes} px (width x "
+        f"between them: {decimal(summary.num_bytes)}, from {summary.num_sources} frames, {sizes} px (width x "
         "height).",
         "",
         f"**License of the frames, as stated by the creator of this set:** {license_text}",

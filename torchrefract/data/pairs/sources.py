@@ -14,7 +14,7 @@ from torchrefract._io import is_remote, read_bytes, replace_file, sizes_in_store
 from torchrefract._validation import UsageError, first_names
 from torchrefract.data.depth_maps import DepthFolder
 from torchrefract.data.frames import Source, check_sizes, evenly_spaced, list_names, select_val_drives, split_frames
-from torchrefract.data.images import EXTENSIONS
+from torchrefract.data.images import EXTENSIONS, warn_of_unread
 from torchrefract.data.media import VIDEOS
 from torchrefract.data.pairs.configuration import differences
 from torchrefract.data.video import video_info
@@ -134,7 +134,10 @@ def find_sources(
     def size_of(name: str) -> int | None:
         return _size(f"{source}/{name}") if sizes is None else sizes[name]
 
-    videos = [file for file in files if file.lower().endswith(VIDEOS)]
+    images, videos = ([file for file in files if file.lower().endswith(kinds)] for kinds in (EXTENSIONS, VIDEOS))
+    if not images and not videos:
+        warn_of_unread(source, files)
+        raise UsageError(f"source must hold {', '.join((*EXTENSIONS, *VIDEOS))} files, got {source}")
     if not videos:
         options = {"drive_by": drive_by, "val_share": val_share, "seed": seed}
         frames = split_frames(source, files, split=None, **options)
@@ -144,7 +147,7 @@ def find_sources(
             reasons = first_names([f"{path} {reason}" for path, reason in unreadable.items()])
             raise ValueError(f"root must hold readable frames, got {reasons} in {source}")
         return Sources(source, table_of(frames, size_of))
-    if images := [file for file in files if file.lower().endswith(EXTENSIONS)]:
+    if images:
         both = f"{images[0]} and {videos[0]}"
         raise UsageError(f"source must hold images or videos, got both in {source}, such as {both}")
     return _find_video_frames(source, {name: size_of(name) for name in videos}, every, val_share, seed)

@@ -279,7 +279,12 @@ def test_an_evaluation_that_is_stopped_has_the_status_of_the_signal(call, traine
         return step(self, batch, index)
 
     monkeypatch.setattr(Restoration, "validation_step", stop)
-    outcome = call("eval", f"ckpt_path={trained.folder / 'best.ckpt'}", "data.workers=0", "data.batch_size=1")
+    # A shell lets programs in the background ignore an interrupt, and Lightning ignores further ones.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        outcome = call("eval", f"ckpt_path={trained.folder / 'best.ckpt'}", "data.workers=0", "data.batch_size=1")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert (outcome.code, outcome.err) == (128 + number, message)
 
 

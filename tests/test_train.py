@@ -288,6 +288,20 @@ def test_an_evaluation_that_is_stopped_has_the_status_of_the_signal(call, traine
     assert (outcome.code, outcome.err) == (128 + number, message)
 
 
+def test_sigterm_in_the_last_validation_has_its_status_behind_the_report(call, small, monkeypatch):
+    step = Restoration.validation_step
+
+    def stop(self, batch, index):
+        if self.current_epoch == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(self, batch, index)
+
+    monkeypatch.setattr(Restoration, "validation_step", stop)
+    outcome = call("train", "+task=undistort", *small, "run_dir=run")
+    assert outcome.code == 143
+    assert outcome.out.splitlines()[-1].startswith("best.ckpt: ")
+
+
 def test_a_training_whose_workers_receive_sigterm_too_stops_with_a_checkpoint(small, tmp_path):
     # Not forked from the tests: a forked process could wait forever for threads of its parent.
     words = ("+task=undistort", *small, "run_dir=run", "trainer.max_epochs=1000", "data.workers=1")

@@ -105,6 +105,10 @@ class StopOnSigterm(Callback):
         if trainer.received_sigterm:
             self._is_pending, trainer._signal_connector.received_sigterm = True, False
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave a signal of the last validation to `stopping`, as the training is complete."""
+        trainer._signal_connector.received_sigterm |= self._is_pending
+
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Write the checkpoint, and say how to continue."""
         if not isinstance(exception, SIGTERMException):
@@ -125,6 +129,8 @@ def stopping(trainer: Trainer, last: Path | None = None) -> Iterator[None]:
     """Raise what a command raises if Lightning stops for a signal or an invalid option; `last` continues a training."""
     try:
         yield
+        if trainer.received_sigterm:
+            raise SIGTERMException
     except SIGTERMException:
         # Lightning kills its first process, which may still write, once another one has ended with an error.
         raise SystemExit(128 + signal.SIGTERM if trainer.is_global_zero else 0) from None

@@ -162,14 +162,18 @@ def local_file(path: Path) -> Iterator[Path]:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder with its parents; stores have none."""
-    if not is_remote(path):
+    """Create a folder with its parents; stores have none. Raises NotADirectoryError if a file has its name."""
+    if is_remote(path):
+        return
+    try:
         path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)) from error
 
 
 def make_writable_folder(path: Path) -> None:
     """Create a folder of this machine with its parents; raise OSError if no file can be created in it."""
-    path.mkdir(parents=True, exist_ok=True)
+    make_folder(path)
     try:
         tempfile.TemporaryFile(dir=path).close()
     except OSError as error:

@@ -217,7 +217,7 @@ def test_an_unreadable_picture_is_one_line_of_error(call, picture, tmp_path):
         ("size=[64,64]", "size: image must be at least size = 64x64"),
         ("out=sheet.doc", r"out must end in one of \.apng, .*\.gif, .*\.mp4, .*\.png, .*\.webp, got sheet.doc"),
         ("out=sheet", "out must end in one of .*, got sheet"),
-        ("out=frame.png/sheet.png", "frame.png/sheet.png could not be written: File exists"),
+        ("out=frame.png/sheet.png", "frame.png/sheet.png could not be written: Not a directory"),
         ("out=folder.png", "out must be a file, got the folder folder.png"),
         ("frames=0", "frames must be at least 1, got 0"),
         ("frames=2.5", "frames must be a whole number, got 2.5"),

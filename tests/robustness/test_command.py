@@ -274,7 +274,7 @@ def test_masks_and_modules_are_taken(score, tmp_path, frames):
         ("severity=[2.5]", "severity must be some of (1, 2, 3, 4, 5), got [2.5]"),
         ("scene=null", "scene must be some of cheap_dashcam, cape_town_fog"),
         ("device=tpu", "device must be auto, cpu or another device of this machine, got tpu"),
-        ("out=coco.json", "out must name what can be read or written, got coco.json: File exists"),
+        ("out=coco.json", "out must name what can be read or written, got coco.json: Not a directory"),
         ("model=damaged.pt", "model must be a TorchScript file of torch.jit.save, got damaged.pt (it is no ZIP"),
         ("model=damaged.pt2", "model must be a program of torch.export or ONNX, got damaged.pt2 (it is no ZIP"),
         ("model=damaged.onnx", "model must be a program of torch.export or ONNX, got damaged.onnx ("),

@@ -92,7 +92,7 @@ def test_an_output_folder_must_be_new_and_lie_outside_of_the_source(call, words,
     message = call("generate", *words("out")).message
     assert message == "out must be a new folder or one of this command, got out, which holds thesis.tex"
     message = call("generate", *words("out/thesis.tex")).message
-    assert message == "out must be a folder that can be written to, got out/thesis.tex (File exists)"
+    assert message == "out must be a folder that can be written to, got out/thesis.tex (Not a directory)"
     assert "out must lie outside of source" in call("generate", *words(frames / "pairs")).message
     assert not (frames / "pairs").exists()
     with pytest.raises(ValueError, match=r"root must be a folder with manifest\.jsonl, got"):

@@ -279,7 +279,7 @@ def test_the_corridor_is_nearer_to_lidar_than_a_flat_road_and_the_ramp(shared_da
         assert (t - exact).square().mean() < 0.85 * (flat - exact).square().mean()
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, below
 def test_walls_are_as_far_away_as_the_sky_above_them_is_low():
     image = torch.full((2, 3, 120, 200), 0.2)
     image[:, :, :31, :] = 0.9  # a skyline 29 rows above the horizon, whose row is 59.5
@@ -292,7 +292,7 @@ def test_walls_are_as_far_away_as_the_sky_above_them_is_low():
     assert_close(depth[0, 0, 110, 190], torch.tensor(1.3 * 200 / 51.0), rtol=0.02, atol=0)  # the road hides the wall
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, below
 def test_a_tree_that_hangs_over_the_sky_is_as_near_as_one_of_two_and_a_half_heights():
     image = torch.full((1, 3, 120, 200), 0.2)
     image[:, :, :51] = 0.9
@@ -302,7 +302,7 @@ def test_a_tree_that_hangs_over_the_sky_is_as_near_as_one_of_two_and_a_half_heig
     assert_close(depth[0, 0, 55, 160], torch.tensor(200 * (6.0 - 1.3) / (59.5 - 50)))
 
 
-@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, the next one
+@pytest.mark.filterwarnings("ignore:depth is that of a road")  # the warning has a test of its own, below
 def test_the_end_of_a_frame_without_sky_moves_slowly_as_its_top_darkens():
     image = 0.35 + 0.5 * torch.rand(21, 3, 120, 192, generator=torch.Generator().manual_seed(0))
     for i, frame in enumerate(image):

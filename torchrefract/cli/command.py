@@ -325,8 +325,8 @@ def _process_message(error: Exception) -> str | None:
     Of the processes of a training, only the first says that another one has ended; the line of others is empty.
     """
     if isinstance(error, RuntimeError) and _LOST_PROCESS.search(str(error)):
-        text = "another process of the training has ended: it printed why, or was killed, as for lack of memory; a "
-        return f"{text}training continues by ckpt_path=" if is_first_process() else ""
+        text = "another process of the training has ended: it printed why, or was killed, as for lack of memory; "
+        return f"{text}ckpt_path=<run>/last.ckpt continues" if is_first_process() else ""
     reason = str(error).strip().rstrip(".")
     if not reason.startswith("DataLoader worker (pid"):
         return None

@@ -118,7 +118,7 @@ def train(cfg: DictConfig) -> None:
         if trainer.is_global_zero:
             _remove_incomplete({run} if cfg.ckpt_path is None else {run, as_path(cfg.ckpt_path).parent}, run)
         _render_scenes(data)
-        with stopping(trainer, as_path(cfg.run_dir) / "last.ckpt"):
+        with stopping(trainer, run / "last.ckpt"):
             trainer.fit(model, data, ckpt_path=cfg.ckpt_path, weights_only=True)
     if trainer.global_step == 0 and trainer.max_epochs != 0:  # 0 writes the configuration alone
         raise UsageError("trainer must make a step, got none; raise its max_steps, max_time or limit_train_batches")

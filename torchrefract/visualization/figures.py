@@ -309,12 +309,13 @@ def _scores(degraded: Degraded, frame: Tensor, *, restored: _Restored | None, fo
     texts = [f"{valid.float().mean().item():.1%} valid"]
     if valid.any():
         before = _psnr(degraded.image, frame, valid)
-        texts.append("unchanged" if before >= _EQUAL_DB else f"{before:.1f} dB corrupted")
+        score = "unchanged" if before >= _EQUAL_DB else f"{before:.1f} dB corrupted"
+        if restored is not None and before < _EQUAL_DB:
+            score += f", {_psnr(restored.image, frame, valid):.1f} dB {restored.label}"
+        texts.append(score)
     if degraded.has("flow"):
         longest = (length(degraded.flow) * degraded.valid).max().item()
         texts.insert(0, f"largest displacement {longest:.3g} px")
-    if restored is not None and "corrupted" in texts[-1]:
-        texts[-1] += f", {_psnr(restored.image, frame, valid):.1f} dB {restored.label}"
     if folds.any():
         texts.append(f"{100 * folds.float().mean().item():.2g}% folded")
     return "; ".join(texts)
